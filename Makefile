@@ -1,0 +1,64 @@
+# No target needs preparation: each installs what it uses, once, into .venv.
+
+# Candidates in order of preference; the first that runs and is new enough is taken.
+PYTHON ?= python3 python3.14 python3.13 python3.12 python3.11 python
+# Passed on to the command of a target: make train ARGS="seed=1 flow=squash"
+ARGS ?=
+
+VENV := .venv
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+CONSTRAINTS := .ci/constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help install train evaluate test test-slow check lint types format clean
+
+help: ## Show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+install: $(STAMP) ## Create .venv and install the project in it
+
+train: $(STAMP) ## Train the default policy (ARGS="key=value ..." for Hydra overrides)
+	$(PY) experiments/train.py $(ARGS)
+
+evaluate: $(STAMP) ## Evaluate a trained run (ARGS="key=value ...")
+	$(PY) experiments/evaluate.py $(ARGS)
+
+test: $(STAMP) ## Run the fast tests
+	$(PY) -m pytest -n auto $(ARGS)
+
+test-slow: $(STAMP) ## Run the tests marked slow
+	$(PY) -m pytest -m slow $(ARGS)
+
+check: lint types ## Check format, lint and types
+
+lint: $(STAMP)
+	$(PY) -m ruff format --check
+	$(PY) -m ruff check
+
+types: $(STAMP)
+	$(PY) -m mypy
+
+format: $(STAMP) ## Format the code and mend what the linter can
+	$(PY) -m ruff format
+	$(PY) -m ruff check --fix
+
+clean: ## Remove caches and build products (never .venv or outputs)
+	rm -rf build dist .mypy_cache .pytest_cache .ruff_cache
+	find cnfp_torchrl experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The constraints go through the environment because that also pins the isolated builds that pip
+# starts; pip 25.3 and later read the second name for those.
+$(STAMP): pyproject.toml $(CONSTRAINTS)
+	@$(PY) -m pip --version >/dev/null 2>&1 && exit 0; \
+	for candidate in $(PYTHON); do \
+		if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+			echo "creating $(VENV) with $$("$$candidate" --version)"; \
+			exec "$$candidate" -m venv --clear $(VENV); \
+		fi; \
+	done; \
+	echo "error: no Python 3.11 or newer among: $(PYTHON); name one with PYTHON=/path/to/python" >&2; \
+	exit 1
+	PIP_CONSTRAINT=$(CONSTRAINTS) PIP_BUILD_CONSTRAINT=$(CONSTRAINTS) PIP_DISABLE_PIP_VERSION_CHECK=1 \
+		$(PY) -m pip install --quiet --editable '.[dev]'
+	@touch $@

@@ -1,0 +1,22 @@
+"""What all tests share: one thread per worker, and the same random numbers for each test."""
+
+import random
+
+import numpy as np
+import pytest
+import torch
+
+
+def pytest_configure() -> None:
+    # pytest-xdist starts one worker per core; more threads than that only wait for each other.
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def seed() -> int:
+    """Seed every global generator, so that a test does not depend on those that ran before it."""
+    value = 0
+    random.seed(value)
+    np.random.seed(value)  # noqa: NPY002  (libraries draw from the global generator)
+    torch.manual_seed(value)
+    return value
