@@ -1,0 +1,24 @@
+"""Bijections from base samples to allowed actions, with exact log-determinants."""
+
+from cnfp_torchrl.bijectors.ball_squash import BallSquash
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages
+from cnfp_torchrl.bijectors.box_squash import BoxSquash
+from cnfp_torchrl.bijectors.chain import BijectorChain
+from cnfp_torchrl.bijectors.ellipsoid_squash import EllipsoidSquash
+from cnfp_torchrl.bijectors.gauge_squash import GaugeSquash
+from cnfp_torchrl.bijectors.paper_squash import paper_squash
+from cnfp_torchrl.bijectors.radial_squash import RadialSquash
+from cnfp_torchrl.bijectors.retraction import Retraction
+
+__all__ = [
+    "BallSquash",
+    "Bijector",
+    "BijectorChain",
+    "BoxSquash",
+    "EllipsoidSquash",
+    "GaugeSquash",
+    "RadialSquash",
+    "Retraction",
+    "Stages",
+    "paper_squash",
+]

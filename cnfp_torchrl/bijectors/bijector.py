@@ -1,0 +1,114 @@
+"""The contract of a bijector: a map from base samples to actions with its log-determinant."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.distributions import Transform, constraints
+
+
+class Stages(NamedTuple):
+    """What a base sample becomes on its way through the stages of a bijector.
+
+    Args:
+        actions: the sample after each stage, ``(stages, *batch, d)``.
+        log_dets: of the map from the base sample to that stage, ``(stages, *batch)``.
+    """
+
+    actions: Tensor
+    log_dets: Tensor
+
+
+class Image(constraints.Constraint):
+    """The image of a bijector, as the support of a distribution."""
+
+    event_dim = 1
+
+    def __init__(self, bijector: Bijector) -> None:
+        self._bijector = bijector
+
+    def check(self, value: Tensor) -> Tensor:
+        """Tell whether each value lies in the image."""
+        return self._bijector.contains(value)
+
+
+class Bijector(Transform):
+    """A bijection from R^d onto a set of actions, batched, one set for each batch element.
+
+    Latent and action have shape ``(*batch, d)``, log-determinants ``(*batch,)``; parameters
+    broadcast against the batch. A bijector states `forward_and_log_det`, `inverse_and_log_det`,
+    `contains` and the `shape` of its parameters; one with several stages also `stages`. Everything
+    that `torch.distributions` asks of a transform follows from these. It is not verified that
+    forward and inverse agree; the tests do that for every bijector of this package.
+    """
+
+    bijective = True
+    domain = constraints.real_vector
+
+    def __init__(self) -> None:
+        super().__init__(cache_size=0)
+
+    @abstractmethod
+    def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action of a latent and log|det d action / d latent|."""
+
+    @abstractmethod
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the latent of an action and log|det d latent / d action|.
+
+        Only for actions of the image. Where tanh is saturated in the dtype the latent is infinite:
+        score samples together with drawing them instead.
+        """
+
+    @abstractmethod
+    def contains(self, action: Tensor) -> Tensor:
+        """Tell whether each action lies in the image, an open set: its boundary has no latent."""
+
+    @property
+    def shape(self) -> torch.Size:
+        """The shape ``(*batch, d)`` that latents must broadcast to; empty if it takes any."""
+        return torch.Size()
+
+    def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action and the log-determinant of stage 0 alone, the map into the bounds.
+
+        That is the log-determinant of the reference entropy (`ReferenceEntropyFlow`). A bijector
+        without retractions is its own reference.
+        """
+        return self.forward_and_log_det(latent)
+
+    def stages(self, latent: Tensor) -> Stages:
+        """Return all intermediate actions and their log-determinants in one pass."""
+        action, log_det = self.forward_and_log_det(latent)
+        return Stages(action.unsqueeze(0), log_det.unsqueeze(0))
+
+    @constraints.dependent_property(is_discrete=False, event_dim=1)
+    def codomain(self) -> constraints.Constraint:
+        """The image."""
+        return Image(self)
+
+    def _call(self, x: Tensor) -> Tensor:
+        return self.forward_and_log_det(x)[0]
+
+    def _inverse(self, y: Tensor) -> Tensor:
+        return self.inverse_and_log_det(y)[0]
+
+    def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return log|det dy/dx| at the latent x; y is not used."""
+        return self.forward_and_log_det(x)[1]
+
+
+def broadcast_shape(*shapes: torch.Size) -> torch.Size:
+    """Return the shape that shapes broadcast to, at once where they are equal or empty."""
+    known = [shape for shape in shapes if len(shape)]
+    if all(shape == known[0] for shape in known):
+        return known[0] if known else torch.Size()
+    return torch.broadcast_shapes(*known)
+
+
+def log_det_zero(value: Tensor) -> Tensor:
+    """Return the log-determinant of the identity at a value, zeros ``(*batch,)``."""
+    return torch.zeros_like(value[..., 0])

@@ -1,0 +1,69 @@
+"""Bijectors applied one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages, broadcast_shape, log_det_zero
+
+
+class BijectorChain(Bijector):
+    r"""Apply bijectors in order, :math:`a = f_1(f_2(\dots f_K(z)))` with :math:`f_K` listed first.
+
+    The log-determinants add up (paper, eq. normalizing_flow). A chain of squashes is the paper's
+    policy: **only the last bijector's set is guaranteed**, because each one moves what those before
+    it placed. `GaugeSquash` is the exact alternative.
+
+    Args:
+        bijectors: in order of application, the last has the highest priority.
+
+    Raises:
+        ValueError: when there is none.
+    """
+
+    def __init__(self, bijectors: Sequence[Bijector]) -> None:
+        super().__init__()
+        if not bijectors:
+            raise ValueError("bijectors: expected at least one, given an empty chain")
+        self.bijectors = tuple(bijectors)
+
+    @property
+    def shape(self) -> torch.Size:
+        return broadcast_shape(*(bijector.shape for bijector in self.bijectors))
+
+    def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        action, total = latent, log_det_zero(latent)
+        for bijector in self.bijectors:
+            action, log_det = bijector.forward_and_log_det(action)
+            total = total + log_det
+        return action, total
+
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        latent, total = action, log_det_zero(action)
+        for bijector in reversed(self.bijectors):
+            latent, log_det = bijector.inverse_and_log_det(latent)
+            total = total + log_det
+        return latent, total
+
+    def contains(self, action: Tensor) -> Tensor:
+        inside = torch.ones_like(action[..., 0], dtype=torch.bool)
+        for bijector in reversed(self.bijectors):
+            inside = inside & bijector.contains(action)
+            interior = bijector.forward_and_log_det(torch.zeros_like(action))[0]
+            action = torch.where(inside.unsqueeze(-1), action, interior)
+            action = bijector.inverse_and_log_det(action)[0]
+        return inside
+
+    def stages(self, latent: Tensor) -> Stages:
+        action = latent.expand(broadcast_shape(latent.shape, self.shape))
+        total = log_det_zero(action)
+        actions, log_dets = [], []
+        for bijector in self.bijectors:
+            inner = bijector.stages(action)
+            actions.append(inner.actions)
+            log_dets.append(total + inner.log_dets)
+            action, total = inner.actions[-1], log_dets[-1][-1]
+        return Stages(torch.cat(actions), torch.cat(log_dets))

@@ -1,0 +1,64 @@
+"""Arithmetic along the rays from a centre, shared by the radial bijectors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.bijectors.bijector import broadcast_shape
+from cnfp_torchrl.geometry import ConstraintSet, Region
+
+
+def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return an offset scaled to a largest component of one, and whether it was as good as zero.
+
+    Ratios of gauges do not depend on the length of the direction, so the scale needs no gradient;
+    in one dimension the direction is a sign and needs none either (its exact zero would come out as
+    rounding error over length). An offset of zero, which has no direction, is given one, so that
+    nothing becomes NaN; and so is one so short that gradients, which grow like 1/length, could
+    overflow when squared (1e-19 in float32, 1e-154 in float64).
+
+    Args:
+        offset: ``(*batch, d)``.
+
+    Returns:
+        The direction ``(*batch, d)`` and the mask ``(*batch,)``.
+    """
+    length = offset.detach().abs().amax(-1, keepdim=True)
+    zero = length < torch.finfo(offset.dtype).tiny ** 0.5
+    if offset.shape[-1] == 1:
+        offset = offset.detach()
+    return torch.where(zero, 1.0, offset) / torch.where(zero, 1.0, length), zero.squeeze(-1)
+
+
+def region_shape(region: Region) -> torch.Size:
+    """Return the shape ``(*batch, d)`` of a region's actions."""
+    active = () if region.active is None else (region.active.shape[:-1],)
+    batch = broadcast_shape(region.centre.shape[:-1], *active, *map(set_batch_shape, region.sets))
+    return torch.Size((*batch, region.centre.shape[-1]))
+
+
+def set_batch_shape(each: ConstraintSet) -> torch.Size:
+    """Return a set's batch shape, faster than `ConstraintSet.batch_shape` where fields agree."""
+    fields = ((getattr(each, name).shape, dims) for name, dims in each.event_dims.items())
+    return broadcast_shape(*(shape[: len(shape) - dims] for shape, dims in fields))
+
+
+def is_inside(offset: Tensor, gauge: Tensor, zero: Tensor) -> Tensor:
+    """Tell whether an offset stays short of the boundary, given the gauge of its direction."""
+    return (offset.abs().amax(-1) * gauge < 1) | zero
+
+
+def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:
+    """Return ``centre + factor (point - centre)``, and the very point where the factor is 1.
+
+    Not ``point - (1 - factor) (point - centre)``: in a small region that would round at the scale
+    of the point instead of the region's.
+
+    Args:
+        centre: ``(*batch, d)``.
+        point: ``(*batch, d)``.
+        factor: ``(*batch,)``.
+    """
+    factor = factor.unsqueeze(-1)
+    return torch.where(factor == 1, point, centre + factor * (point - centre))

@@ -1,0 +1,66 @@
+"""One retraction on its own: from a set into its intersection with another."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
+from cnfp_torchrl.bijectors.rays import (
+    is_inside,
+    scale_about,
+    scaled_direction,
+    set_batch_shape,
+)
+from cnfp_torchrl.geometry import ConstraintSet
+
+
+class Retraction(Bijector):
+    r"""Retract a set radially onto its intersection with another one, about a common centre.
+
+    With :math:`v = x - c`: :math:`a = c + s v`, :math:`s = g_{outer}(v) /
+    \max(g_{outer}(v), g_{inner}(v))`, :math:`\log|\det| = d \log s`.
+
+    Args:
+        outer: the set that the argument lies in, bounded in every direction. It is not eroded here:
+            a squash onto it leaves its margin already, and an argument beyond it by a rounding
+            error would leave the inner set by that error's share of the distance to the boundary.
+        inner: the set to retract into.
+        centre: a point strictly inside both, ``(*batch, d)``.
+    """
+
+    def __init__(self, outer: ConstraintSet, inner: ConstraintSet, centre: Tensor) -> None:
+        super().__init__()
+        bounds = outer.bounding_box()
+        magnitude = torch.maximum(bounds.low.abs(), bounds.high.abs()).amax(-1)
+        self._outer, self._inner, self._centre = outer, inner.eroded(magnitude), centre
+
+    @property
+    def shape(self) -> torch.Size:
+        batch = broadcast_shape(
+            self._centre.shape[:-1], set_batch_shape(self._outer), set_batch_shape(self._inner)
+        )
+        return torch.Size((*batch, self._centre.shape[-1]))
+
+    def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        share = self._share(latent - self._centre)
+        return scale_about(self._centre, latent, share), latent.shape[-1] * share.log()
+
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        share = self._share(action - self._centre)
+        return scale_about(self._centre, action, 1 / share), -action.shape[-1] * share.log()
+
+    def contains(self, action: Tensor) -> Tensor:
+        offset = action - self._centre
+        direction, zero = scaled_direction(offset)
+        _, inner = self._gauges(direction)
+        return is_inside(offset, inner, zero)
+
+    def _share(self, offset: Tensor) -> Tensor:
+        direction, zero = scaled_direction(offset)
+        outer, inner = self._gauges(direction)
+        return torch.where(zero, 1.0, outer / inner)
+
+    def _gauges(self, direction: Tensor) -> tuple[Tensor, Tensor]:
+        outer = self._outer.gauge(direction, self._centre)
+        return outer, torch.maximum(outer, self._inner.gauge(direction, self._centre))

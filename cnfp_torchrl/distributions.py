@@ -1,0 +1,149 @@
+"""Distributions over allowed actions: a base distribution pushed through a bijector."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, TransformedDistribution
+
+from cnfp_torchrl.bijectors import Bijector, Stages
+from cnfp_torchrl.bijectors.bijector import broadcast_shape
+
+Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
+
+
+class ConstrainedFlow(TransformedDistribution):
+    r"""The distribution of :math:`a = f(z)`, z from the base and f a bijector onto allowed actions.
+
+    :math:`\log \pi(a) = \log p(z) - \log|\det \partial f/\partial z|` (paper, eq.
+    change_of_variables). Every sample, mode and deterministic action lies in the image of the
+    bijector, whatever the base.
+
+    Draw and score together with `rsample_and_log_prob`: `log_prob` of a given action inverts the
+    bijector, and where tanh is saturated in the dtype the inverse is lost.
+
+    Args:
+        base: over R^d with ``event_shape (d,)``, of float32 or float64; expanded to the batch shape
+            of the bijector where that is larger, so that each set has samples of its own.
+        bijector: from R^d onto the allowed actions.
+
+    Raises:
+        ValueError: when the base is not a distribution over vectors of the bijector's dimension,
+            or, on sampling, is one of half precision.
+    """
+
+    def __init__(self, base: Distribution, bijector: Bijector) -> None:
+        if len(base.event_shape) != 1:
+            raise ValueError(
+                "base: expected a distribution over vectors (event_shape (d,)), given "
+                f"{type(base).__name__} with event_shape {tuple(base.event_shape)}; wrap it in "
+                "torch.distributions.Independent(base, 1)"
+            )
+        super().__init__(_expanded(base, bijector), bijector, validate_args=False)
+        self.bijector = bijector
+
+    def expand(
+        self, batch_shape: Shape, _instance: ConstrainedFlow | None = None
+    ) -> ConstrainedFlow:
+        """Return the same distribution with a larger batch shape."""
+        return type(self)(self.base_dist.expand(torch.Size(batch_shape)), self.bijector)
+
+    def rsample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
+        """Return reparametrised actions ``(*sample, *batch, d)`` and their log-densities."""
+        latent = _checked(self.base_dist.rsample(torch.Size(sample_shape)))
+        action, log_det = self._forward_and_scored_log_det(latent)
+        return action, self.base_dist.log_prob(latent) - log_det
+
+    def sample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
+        """Return actions ``(*sample, *batch, d)`` without gradients and their log-densities.
+
+        The log-densities keep the gradient of the score function, as TorchRL's distributions do.
+        """
+        latent = _checked(self.base_dist.sample(torch.Size(sample_shape)))
+        with torch.no_grad():
+            action, log_det = self._forward_and_scored_log_det(latent)
+        return action, self.base_dist.log_prob(latent) - log_det
+
+    def rsample(self, sample_shape: Shape = ()) -> Tensor:
+        """Return reparametrised actions ``(*sample, *batch, d)``."""
+        return self.bijector(_checked(self.base_dist.rsample(torch.Size(sample_shape))))
+
+    def sample(self, sample_shape: Shape = ()) -> Tensor:
+        """Return actions ``(*sample, *batch, d)`` without gradients."""
+        with torch.no_grad():
+            return self.bijector(_checked(self.base_dist.sample(torch.Size(sample_shape))))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density of actions by inversion, -inf outside the support.
+
+        A NaN action has a NaN density. On the boundary, where saturated actions of float32 may lie,
+        the density's limit is taken: -inf.
+        """
+        outside = ~(self.bijector.contains(value) | value.isnan().any(-1))
+        interior = self.bijector(torch.zeros_like(value))
+        inside_value = torch.where(outside.unsqueeze(-1), interior, value)
+        latent, log_det = self.bijector.inverse_and_log_det(inside_value)
+        return torch.where(outside, -torch.inf, self.base_dist.log_prob(latent) + log_det)
+
+    def stages(self, latent: Tensor) -> Stages:
+        """Return intermediate actions and log-determinants of latents ``(*sample, *batch, d)``."""
+        return self.bijector.stages(latent)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The base mean pushed through the flow, ``(*batch, d)``: the action without noise."""
+        return self.bijector(_checked(self.base_dist.mean))
+
+    @property
+    def mode(self) -> Tensor:
+        """The deterministic action: the density's own mode has no closed form."""
+        return self.deterministic_sample
+
+    @property
+    def mean(self) -> Tensor:
+        """The deterministic action: the true mean has no closed form and may break a constraint.
+
+        TorchRL asks for it under `ExplorationType.MEAN`; without it, it would take the mean of 1000
+        samples, which can lie outside a non-convex set.
+        """
+        return self.deterministic_sample
+
+    def _forward_and_scored_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        return self.bijector.forward_and_log_det(latent)
+
+
+class ReferenceEntropyFlow(ConstrainedFlow):
+    r"""The same samples, scored jointly by their density in the coordinates of stage 0.
+
+    `rsample_and_log_prob` and `sample_and_log_prob` leave the retractions' :math:`d \log s` out, so
+    that the negative mean is the entropy of the tanh-squashed base in the action bounds, for which
+    the usual target entropy -d is right and whose gradient is bounded (`method.md`, section 2,
+    Entropy). For losses only; `log_prob` remains the true density.
+    """
+
+    def _forward_and_scored_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        return self.bijector.forward_and_reference_log_det(latent)
+
+
+def _expanded(base: Distribution, bijector: Bijector) -> Distribution:
+    *batch, dim = bijector.shape or base.event_shape
+    if dim != base.event_shape[0]:
+        raise ValueError(
+            f"base: expected event_shape ({dim},), the bijector's action dimension, given "
+            f"{tuple(base.event_shape)}"
+        )
+    shape = torch.Size(batch)
+    if len(shape) == 0 or shape == base.batch_shape:
+        return base
+    return base.expand(broadcast_shape(shape, base.batch_shape))
+
+
+def _checked(latent: Tensor) -> Tensor:
+    if latent.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"base: expected samples of float32 or float64, given {latent.dtype}; convert its "
+            "parameters (half precision cannot hold a boundary with zero tolerance)"
+        )
+    return latent

@@ -1,0 +1,33 @@
+"""Sets of allowed actions and their intersections: containment, slack, gauges, centres."""
+
+from cnfp_torchrl.geometry.ball import Ball
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.centres import MINIMUM_SLACK, chebyshev_centre, lexicographic_centre
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
+from cnfp_torchrl.geometry.half_spaces import HalfSpaces
+from cnfp_torchrl.geometry.positive_part import PositivePart
+from cnfp_torchrl.geometry.region import Region
+from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
+from cnfp_torchrl.geometry.visible_region import VisibleRegion
+from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
+
+__all__ = [
+    "MINIMUM_SLACK",
+    "Ball",
+    "Box",
+    "Cone",
+    "ConstraintSet",
+    "Ellipsoid",
+    "GeometryError",
+    "HalfSpaces",
+    "KinkedSum",
+    "PositivePart",
+    "Region",
+    "Rows",
+    "Superlevel",
+    "VisibleRegion",
+    "WeightedL1Ball",
+    "chebyshev_centre",
+    "lexicographic_centre",
+]

@@ -1,0 +1,62 @@
+"""Boxes: independent bounds for each action component."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.superlevel import Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Box(ConstraintSet):
+    r"""The box :math:`\{a : low \le a \le high\}`; infinite bounds are allowed.
+
+    Args:
+        low: lower bounds ``(*batch, d)``.
+        high: upper bounds ``(*batch, d)``, each greater than its lower bound.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"low": 1, "high": 1}
+
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "low", self.low >= self.high, "low < high"
+
+    def contains(self, action: Tensor) -> Tensor:
+        return ((action >= self.low) & (action <= self.high)).all(-1)
+
+    def slack(self, action: Tensor) -> Tensor:
+        return torch.minimum(self.high - action, action - self.low).amin(-1)
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        upper = direction / (self.high - centre)
+        lower = direction / (self.low - centre)
+        return torch.maximum(upper, lower).amax(-1)
+
+    def bounding_box(self) -> Box:
+        return self
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        # Beside an infinite bound coordinates, and their errors, are as large as the actions.
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.low.device)
+        size = torch.maximum(self.low.abs(), self.high.abs())
+        size = torch.where(size.isinf(), largest.unsqueeze(-1), size)
+        return type(self)(self.low + eps * size, self.high - eps * size, validate_args=False)
+
+    def unit_about(self, centre: Tensor) -> Self:
+        return type(self)(centre - 1, centre + 1, validate_args=False)
+
+    def superlevel(self) -> Rows:
+        identity = torch.eye(self.dim, dtype=self.dtype, device=self.low.device)
+        low, high = torch.broadcast_tensors(self.low, self.high)
+        offsets = torch.cat([high, -low], -1)
+        return Rows(torch.cat([identity, -identity]), offsets, torch.ones_like(offsets))

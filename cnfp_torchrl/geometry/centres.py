@@ -1,0 +1,177 @@
+"""Centres of intersections of sets, and which sets hold, by the lexicographic rule."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.barrier import Best, maximise_slack
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry.cutting_planes import maximise_slack_by_cuts
+from cnfp_torchrl.geometry.slack_program import Program
+
+MINIMUM_SLACK = 5e-5
+"""The least slack, in action units, of an intersection that is worth holding.
+
+Gauges about a centre with slack h carry a relative error of eps |a| / h, in float32 some 1e-3 for
+actions of size one at this slack; smaller is not much use. Larger would drop thin sets: in 32
+dimensions the largest ball in a weighted L1 ball 1e-3 wide has a radius of 8.8e-5.
+"""
+
+
+@torch.no_grad()
+def lexicographic_centre(
+    sets: Sequence[ConstraintSet],
+    candidate: Tensor | None = None,
+    minimum_slack: float = MINIMUM_SLACK,
+) -> tuple[Tensor, Tensor]:
+    r"""Find which sets can hold together in each state, and a point well inside those.
+
+    :math:`S = A_0`; for k from the highest priority K down to 1: if S and :math:`A_k` have a common
+    point with the minimum slack, :math:`S = S \cap A_k`, else :math:`A_k` is inactive in this
+    state. A set is dropped only on a certified upper bound of the slack below the minimum. Slack is
+    counted in sets eroded for rounding error twice: once for the actions, once for the centre.
+
+    Args:
+        sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
+            which always holds, and the last has the highest priority.
+        candidate: points that may lie in all sets, ``(*batch, d)``. Where one does, with the
+            minimum slack, the centre is found from it without a search, on its way to the middle of
+            all boxes. Elsewhere, or with None, the centre has at least half of the best slack.
+        minimum_slack: in action units.
+
+    Returns:
+        The centres ``(*batch, d)`` and the active flags, boolean ``(*batch, K + 1)``.
+
+    Raises:
+        GeometryError: when ``sets[0]`` is no box, or is unbounded where a search is needed.
+    """
+    if not sets or not isinstance(sets[0], Box):
+        given = [type(each).__name__ for each in sets]
+        raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
+    magnitude = torch.maximum(sets[0].low.abs(), sets[0].high.abs()).amax(-1)
+    once = [each.eroded(magnitude) for each in sets]
+    twice = [each.eroded(magnitude) for each in once]
+    boxes = _common_box(twice)
+    if candidate is None:
+        # No point has more slack than the middle of all boxes has in the boxes.
+        centre = (boxes.low + boxes.high) / 2
+        slack = _least_slack(twice, centre)
+        good = (slack >= minimum_slack) & (2 * slack >= boxes.slack(centre))
+        centre = centre.expand(*good.shape, -1)
+    else:
+        centre, good = _from_candidate(once, twice, candidate, boxes, minimum_slack)
+    active = good.unsqueeze(-1).expand(*good.shape, len(sets))
+    if bool(good.all()):
+        return centre, active.clone()
+    index = (~good).flatten().nonzero().squeeze(-1)
+    hard = [each.select(good.shape, index) for each in twice]
+    points, flags = _search(hard, minimum_slack)
+    centre = centre.reshape(-1, centre.shape[-1]).index_copy(0, index, points.to(centre.dtype))
+    active = active.reshape(-1, len(sets)).index_copy(0, index, flags)
+    return centre.view(*good.shape, -1), active.view(*good.shape, -1)
+
+
+def chebyshev_centre(
+    sets: Sequence[ConstraintSet],
+    active: Tensor | None = None,
+    enough: float = MINIMUM_SLACK,
+    share: float = 0.5,
+) -> Best:
+    """Find points whose smallest slack in all sets is a large share of the best one.
+
+    A batched interior-point method in float64. It stops early where the best slack is certainly
+    below `enough`; then the upper bound says so, and the point is of no use. A set that does not
+    describe its `superlevel` is cut out by linearisations of its slack, which takes longer. Of a
+    non-convex set a convex part counts.
+
+    Args:
+        sets: sets of batch shape ``(B,)``, the first a finite box.
+        active: which sets count, boolean ``(B, len(sets))``; None means all.
+        enough: the smallest slack of interest, in action units.
+        share: the share of the best slack that will do, below 1.
+
+    Returns:
+        Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
+
+    Raises:
+        GeometryError: when the first set is no finite box.
+        RuntimeError: when the search does not come to an end.
+    """
+    wide = [each.with_fields(lambda field, _: field.double()) for each in sets]
+    bounds = wide[0]
+    if not isinstance(bounds, Box) or not bool((bounds.high - bounds.low).isfinite().all()):
+        raise GeometryError("sets[0]: expected a finite Box of action bounds")
+    if active is None:
+        active = bounds.low.new_ones(*bounds.batch_shape, len(sets)).bool()
+    start = (bounds.low + bounds.high) / 2
+    scale = (bounds.high - bounds.low).mean(-1)
+    parts = [each.superlevel() for each in wide]
+    described = [i for i, part in enumerate(parts) if part is not None]
+    known = [part for part in parts if part is not None]
+    problem = Program.stack(known, active[:, described])
+    others = [i for i, part in enumerate(parts) if part is None]
+    if not others:
+        return maximise_slack(problem, start, scale, enough, share)
+    return maximise_slack_by_cuts(
+        problem, [wide[i] for i in others], active[:, others], start, scale, enough, share
+    )
+
+
+def _search(sets: Sequence[ConstraintSet], minimum_slack: float) -> tuple[Tensor, Tensor]:
+    """Apply the lexicographic rule by the general method to sets of batch shape ``(B,)``."""
+    best = chebyshev_centre(sets, None, minimum_slack)
+    point, together = best.action, best.upper_bound >= minimum_slack
+    active = together.unsqueeze(-1).repeat(1, len(sets))
+    active[:, 0] = True
+    index = (~together).nonzero().squeeze(-1)
+    if not len(index):
+        return point, active
+    sets = [each.select(together.shape, index) for each in sets]
+    chosen = active[index]
+    bounds = sets[0]
+    assert isinstance(bounds, Box)
+    centre = ((bounds.low + bounds.high) / 2).double()
+    for k in range(len(sets) - 1, 0, -1):
+        trial = chosen.clone()
+        trial[:, k] = True
+        best = chebyshev_centre(sets, trial, minimum_slack)
+        fits = best.upper_bound >= minimum_slack
+        chosen[:, k] = fits
+        centre = torch.where(fits.unsqueeze(-1), best.action, centre)
+    return point.index_copy(0, index, centre), active.index_copy(0, index, chosen)
+
+
+def _from_candidate(
+    once: Sequence[ConstraintSet],
+    twice: Sequence[ConstraintSet],
+    point: Tensor,
+    boxes: Box,
+    minimum_slack: float,
+) -> tuple[Tensor, Tensor]:
+    """Move from points with enough slack towards the middle of all boxes, half of the way out."""
+    good = _least_slack(twice, point) >= minimum_slack
+    point = point.expand(*good.shape, -1)
+    way = (boxes.low + boxes.high) / 2 - point
+    gauges = [each.gauge(way, point) for each in once]
+    gauge = torch.stack(torch.broadcast_tensors(*gauges)).amax(0)
+    moved = point + way * (0.5 / gauge).clamp(max=1).unsqueeze(-1)
+    # In convex sets at least half of the slack is left; a set of another shape may have a corner
+    # beside the way, and half of little may be too little.
+    roomy = _least_slack(twice, moved) >= minimum_slack
+    return torch.where((good & roomy).unsqueeze(-1), moved, point), good
+
+
+def _least_slack(sets: Sequence[ConstraintSet], point: Tensor) -> Tensor:
+    slacks = torch.broadcast_tensors(*(each.slack(point) for each in sets))
+    return torch.stack(slacks).amin(0)
+
+
+def _common_box(sets: Sequence[ConstraintSet]) -> Box:
+    boxes = [each for each in sets if isinstance(each, Box)]
+    low = torch.stack(torch.broadcast_tensors(*(box.low for box in boxes))).amax(0)
+    high = torch.stack(torch.broadcast_tensors(*(box.high for box in boxes))).amin(0)
+    return Box(low, high, validate_args=False)

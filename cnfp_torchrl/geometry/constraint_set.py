@@ -1,0 +1,231 @@
+"""The contract of a set of allowed actions: a typed, batched value made of plain tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import InitVar, dataclass
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.superlevel import Superlevel
+
+if TYPE_CHECKING:
+    from cnfp_torchrl.geometry.box import Box
+
+EROSION_IN_EPS = 16.0
+"""How many units of rounding error `ConstraintSet.eroded` moves a boundary inwards."""
+
+
+class GeometryError(ValueError):
+    """A set that is no set: names the constraint, the field, what was expected and given."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintSet(ABC):
+    """A batch of sets of allowed actions in R^d, one set for each batch element.
+
+    A family is a frozen dataclass whose fields are floating tensors ``(*batch, *event)``; the batch
+    shapes broadcast against each other and against the actions ``(*sample, *batch, d)``. A family
+    states
+
+    - `event_dims`: the number of event dimensions of each field,
+    - `violations`: what makes field values invalid beyond shapes, dtypes and NaN,
+    - `slack`, `gauge`, `contains`, `bounding_box`: its geometry,
+    - `eroded`: the set moved inwards by the rounding error of its own arithmetic,
+    - `unit_about`: any well-conditioned set of the family around a point.
+
+    Constructing a set checks it, which reads tensors on the host. Hot paths, whose values were
+    checked where they entered, construct with ``validate_args=False``.
+
+    Raises:
+        GeometryError: when a field has the wrong shape or dtype, contains NaN, or describes no set.
+    """
+
+    validate_args: InitVar[bool] = dataclasses.field(default=True, kw_only=True)
+    event_dims: ClassVar[Mapping[str, int]]
+
+    def __post_init__(self, validate_args: bool) -> None:
+        if validate_args:
+            self.validate()
+
+    # What a family states -------------------------------------------------------------------------
+
+    @abstractmethod
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
+
+    @abstractmethod
+    def contains(self, action: Tensor) -> Tensor:
+        """Tell, with zero tolerance, whether each action ``(*batch, d)`` lies in its set.
+
+        The arithmetic is done in float64 whatever the dtype, so that the answer concerns the given
+        numbers and not the rounding of the test.
+        """
+
+    @abstractmethod
+    def slack(self, action: Tensor) -> Tensor:
+        """Return how far inside an action is: positive inside, negative outside, concave in it.
+
+        The distance to the boundary, or a lower bound of it where it has no closed form.
+        """
+
+    @abstractmethod
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        r"""Return the gauge about a centre, :math:`g(v) = \inf\{t > 0 : c + v/t \in C\}`.
+
+        The boundary lies at ``centre + direction / gauge``; 0 where the set has no end that way.
+
+        Args:
+            direction: ``(*batch, d)``, not zero.
+            centre: ``(*batch, d)``, strictly inside the set; elsewhere the result is meaningless.
+        """
+
+    @abstractmethod
+    def bounding_box(self) -> Box:
+        """Return a box around the set; its bounds are infinite where the set has no end."""
+
+    @abstractmethod
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        """Return the set moved inwards by a few units of rounding error, absolutely.
+
+        A point of the eroded set computed in the set's dtype, with coordinates of at most
+        `magnitude`, lies in the true set with zero tolerance.
+        """
+
+    @abstractmethod
+    def unit_about(self, centre: Tensor) -> Self:
+        """Return a set of this family, of size one, about a point, with fields shaped as here."""
+
+    def superlevel(self) -> Superlevel | None:
+        """Describe the actions with a slack of at least t, for the search for centres.
+
+        None, the default, makes the search linearise `slack` instead: right for any concave slack,
+        but slower. A non-convex family describes a convex part of its set.
+        """
+        return None
+
+    # What follows from it -------------------------------------------------------------------------
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return the fields by name, in the order of the constructor."""
+        return {name: getattr(self, name) for name in self.event_dims}
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The shape that the batch shapes of all fields broadcast to."""
+        return torch.broadcast_shapes(
+            *(value.shape[: value.ndim - self.event_dims[n]] for n, value in self.fields().items())
+        )
+
+    @property
+    def dim(self) -> int:
+        """The dimension d of the action space."""
+        return next(int(v.shape[-1]) for n, v in self.fields().items() if self.event_dims[n] > 0)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The floating type of the fields."""
+        return next(iter(self.fields().values())).dtype
+
+    def with_fields(self, change: Callable[[Tensor, int], Tensor]) -> Self:
+        """Return the set with each field replaced by a function of it and its event dimensions."""
+        changed = {n: change(value, self.event_dims[n]) for n, value in self.fields().items()}
+        return type(self)(**changed, validate_args=False)
+
+    def select(self, batch_shape: torch.Size, index: Tensor) -> Self:
+        """Return the sets of some batch elements, given by their flat indices in a batch shape."""
+
+        def chosen(field: Tensor, event_dims: int) -> Tensor:
+            event = field.shape[field.ndim - event_dims :]
+            return field.expand(*batch_shape, *event).reshape(-1, *event)[index]
+
+        return self.with_fields(chosen)
+
+    def where(self, mask: Tensor, other: Self) -> Self:
+        """Return this set where the mask ``(*batch,)`` is true and the other one elsewhere."""
+        mine, theirs = self.fields(), other.fields()
+        return type(self)(
+            **{
+                name: torch.where(mask[(...,) + (None,) * dims], mine[name], theirs[name])
+                for name, dims in self.event_dims.items()
+            },
+            validate_args=False,
+        )
+
+    def validate(self, name: str | None = None) -> Self:
+        """Return the set itself, or refuse it.
+
+        Args:
+            name: the constraint's name, for the message.
+
+        Raises:
+            GeometryError: naming constraint, field, batch index, the expected and the given.
+        """
+        kind = type(self).__name__
+        where = f"constraint '{name}' ({kind})" if name else kind
+        self._validate_shapes(where)
+        for field, value in self.fields().items():
+            self._refuse(where, field, torch.isnan(value), "a number")
+        for field, bad, expected in self.violations():
+            self._refuse(where, field, bad, expected)
+        return self
+
+    def _validate_shapes(self, where: str) -> None:
+        dtypes = {name: getattr(value, "dtype", None) for name, value in self.fields().items()}
+        for name, value in self.fields().items():
+            if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
+                given = dtypes[name] or type(value).__name__
+                raise GeometryError(
+                    f"{where}, field '{name}': expected a float32 or float64 tensor, given {given}; "
+                    "convert it (half precision cannot hold a boundary with zero tolerance)"
+                )
+            if value.ndim < self.event_dims[name]:
+                raise GeometryError(
+                    f"{where}, field '{name}': expected at least {self.event_dims[name]} "
+                    f"dimensions (*batch, ...), given shape {tuple(value.shape)}"
+                )
+        if len(set(dtypes.values())) > 1:
+            raise GeometryError(f"{where}: expected one dtype for all fields, given {dtypes}")
+        widths = {
+            n: int(v.shape[-1])
+            for n, v in self.fields().items()
+            if self.event_dims[n] > 0 and n not in self.fields_of_other_width()
+        }
+        if len(set(widths.values())) > 1 or 0 in widths.values():
+            raise GeometryError(
+                f"{where}: expected fields of one action dimension d >= 1, given last sizes {widths}"
+            )
+        problem = self.shape_problem()
+        if problem is not None:
+            raise GeometryError(f"{where}: {problem}")
+        try:
+            _ = self.batch_shape
+        except RuntimeError:
+            shapes = {name: tuple(value.shape) for name, value in self.fields().items()}
+            raise GeometryError(
+                f"{where}: expected batch shapes that broadcast, given {shapes}"
+            ) from None
+
+    def shape_problem(self) -> str | None:
+        """Say what is wrong with the event shapes beyond a common dimension, if anything is."""
+        return None
+
+    @classmethod
+    def fields_of_other_width(cls) -> frozenset[str]:
+        """Name the fields whose last size is not the action dimension."""
+        return frozenset()
+
+    def _refuse(self, where: str, field: str, bad: Tensor, expected: str) -> None:
+        if not bool(bad.any()):
+            return
+        index = tuple(int(i) for i in bad.nonzero()[0])
+        value = getattr(self, field)
+        given = value.expand(bad.shape)[index] if value.ndim <= bad.ndim else value[index]
+        at = f" at index {list(index)}" if index else ""
+        raise GeometryError(
+            f"{where}, field '{field}'{at}: expected {expected}, given {given.tolist()}"
+        )

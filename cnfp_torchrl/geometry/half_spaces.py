@@ -1,0 +1,91 @@
+"""Half-spaces: linear inequalities on actions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.superlevel import Rows
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaces(ConstraintSet):
+    r"""The intersection of half-spaces, :math:`\{a : normals_j \cdot a \le offsets_j\}`.
+
+    It need not be bounded. A control barrier function gives one row,
+    :math:`-L_g h \cdot a \le L_f h + \alpha(h)`.
+
+    Args:
+        normals: ``(*batch, m, d)``, finite, none of them zero.
+        offsets: ``(*batch, m)``; an infinite one lets every action pass.
+    """
+
+    normals: Tensor
+    offsets: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
+
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "normals", self.normals.isinf(), "a finite normal"
+        yield "normals", (self.normals == 0).all(-1), "a normal that is not zero"
+        yield "offsets", self.offsets.isneginf(), "an offset above -inf"
+
+    def shape_problem(self) -> str | None:
+        rows, offsets = self.normals.shape[-2], self.offsets.shape[-1]
+        if rows == offsets and rows > 0:
+            return None
+        return f"expected as many offsets as normals, at least 1, given {offsets} and {rows}"
+
+    @classmethod
+    def fields_of_other_width(cls) -> frozenset[str]:
+        return frozenset({"offsets"})
+
+    def contains(self, action: Tensor) -> Tensor:
+        return (_rows(self.normals.double(), action.double()) <= self.offsets.double()).all(-1)
+
+    def slack(self, action: Tensor) -> Tensor:
+        room = self.offsets - _rows(self.normals, action)
+        return (room / vector_norm(self.normals, dim=-1)).amin(-1)
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        room = self.offsets - _rows(self.normals, centre)
+        return (_rows(self.normals, direction) / room).amax(-1).clamp(min=0)
+
+    def bounding_box(self) -> Box:
+        """Return the bounds that single rows with one component set; the others are infinite."""
+        single = (self.normals != 0).sum(-1, keepdim=True) == 1
+        bound = self.offsets.unsqueeze(-1) / self.normals
+        high = torch.where(single & (self.normals > 0), bound, torch.inf).amin(-2)
+        low = torch.where(single & (self.normals < 0), bound, -torch.inf).amax(-2)
+        return Box(low, high, validate_args=False)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
+        size = self.normals.abs().sum(-1) * largest.unsqueeze(-1) + self.offsets.abs()
+        offsets = torch.where(self.offsets.isinf(), self.offsets, self.offsets - eps * size)
+        return type(self)(self.normals, offsets, validate_args=False)
+
+    def unit_about(self, centre: Tensor) -> Self:
+        normals = torch.zeros_like(self.normals[..., :1, :])
+        normals[..., 0] = 1
+        offsets = centre[..., :1] + 1
+        return type(self)(
+            normals.expand_as(self.normals),
+            offsets.expand(*offsets.shape[:-1], self.offsets.shape[-1]),
+            validate_args=False,
+        )
+
+    def superlevel(self) -> Rows:
+        return Rows(self.normals, self.offsets, vector_norm(self.normals, dim=-1))
+
+
+def _rows(normals: Tensor, vector: Tensor) -> Tensor:
+    return (normals * vector.unsqueeze(-2)).sum(-1)

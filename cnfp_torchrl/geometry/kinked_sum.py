@@ -1,0 +1,102 @@
+"""Sums of kinked terms, a shared base: weighted L1 balls and bounds of positive parts."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+from cnfp_torchrl.geometry.superlevel import KinkedSum
+
+
+@dataclass(frozen=True, eq=False)
+class KinkedSumBound(ConstraintSet):
+    r"""The set :math:`\{a : \sum_i \max(\alpha_i a_i, \beta_i a_i) \le bound\}`.
+
+    With :math:`\alpha_i \ge 0 \ge \beta_i`, which a family derives from its weights. Contains 0.
+
+    Args:
+        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
+        bound: ``(*batch,)``, positive and finite.
+    """
+
+    weights: Tensor
+    bound: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"weights": 1, "bound": 0}
+
+    @staticmethod
+    @abstractmethod
+    def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Return :math:`\alpha \ge 0` and :math:`\beta \le 0`, each ``(*batch, d)``."""
+
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "weights", self.weights.isinf(), "a finite weight"
+        yield "bound", (self.bound <= 0) | self.bound.isinf(), "a finite bound > 0"
+
+    def contains(self, action: Tensor) -> Tensor:
+        return self._total(self.weights.double(), action.double()) <= self.bound.double()
+
+    def slack(self, action: Tensor) -> Tensor:
+        """Return ``(bound - sum) / |weights|``; infinite where all weights are zero."""
+        return (self.bound - self._total(self.weights, action)) / vector_norm(self.weights, dim=-1)
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        r"""Return the gauge about a centre, in O(d log d).
+
+        Along the ray the sum is convex and piecewise linear in t with at most d kinks. Each piece
+        is part of a line :math:`I_j + S_j t` that lies below the sum everywhere, so
+        :math:`g = \max(0, \max_j S_j / (bound - I_j))`, where a piece's :math:`bound - I_j` is
+        positive because the sum at t = 0 is below the bound.
+        """
+        side = self._side_at_exit(direction.detach(), centre.detach())
+        room = self.bound - (side * centre).sum(-1)
+        return ((side * direction).sum(-1) / room).clamp(min=0)
+
+    def bounding_box(self) -> Box:
+        upper, lower = self.slopes(self.weights)
+        bound = self.bound.unsqueeze(-1)
+        # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
+        return Box(-bound / lower.abs(), bound / upper, validate_args=False)
+
+    def unit_about(self, centre: Tensor) -> Self:
+        # The sum is at most |centre|_1 at the centre, and grows at most by one each unit.
+        weights = torch.full_like(self.weights, self.dim**-0.5)
+        return type(self)(weights, centre.abs().sum(-1) + 1, validate_args=False)
+
+    def superlevel(self) -> KinkedSum:
+        return KinkedSum(*self.slopes(self.weights), self.bound, vector_norm(self.weights, dim=-1))
+
+    def _total(self, weights: Tensor, action: Tensor) -> Tensor:
+        upper, lower = self.slopes(weights)
+        return torch.maximum(upper * action, lower * action).sum(-1)
+
+    def _side_at_exit(self, direction: Tensor, centre: Tensor) -> Tensor:
+        """Return the slope of each term where the ray leaves the set, ``(*batch, d)``."""
+        centre, direction = torch.broadcast_tensors(centre, direction)
+        starts_up = (centre > 0) | ((centre == 0) & (direction > 0))
+        ends_up = torch.where(direction == 0, starts_up, direction > 0)
+        upper, lower = self.slopes(self.weights)
+        before, after = torch.where(starts_up, upper, lower), torch.where(ends_up, upper, lower)
+        kinks = torch.where(starts_up == ends_up, torch.inf, -centre / direction)
+        turn = after - before
+        kinks, turn, centre_, direction_ = torch.broadcast_tensors(kinks, turn, centre, direction)
+        ordered, order = kinks.sort(-1)
+        slopes = _running(before * direction, (turn * direction_).gather(-1, order))
+        intercepts = _running(before * centre, (turn * centre_).gather(-1, order))
+        last = (slopes / (self.bound.unsqueeze(-1) - intercepts)).argmax(-1, keepdim=True)
+        # Kinks are positive: before the first one, none has been passed.
+        ordered = torch.cat([torch.full_like(ordered[..., :1], -1.0), ordered], -1)
+        return torch.where(kinks <= ordered.gather(-1, last), after, before)
+
+
+def _running(terms: Tensor, changes: Tensor) -> Tensor:
+    """Return the sum of the terms, and after each change, ``(*batch, d + 1)``."""
+    return torch.cat([terms.sum(-1, keepdim=True), changes], -1).cumsum(-1)

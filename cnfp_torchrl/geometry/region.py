@@ -1,0 +1,116 @@
+"""The region of allowed actions in a state: an intersection of sets, seen from one centre."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The intersection of the action bounds with the active ones of K constraint sets.
+
+    Args:
+        sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
+            holds, the last has the highest priority.
+        centre: a point strictly inside all active sets, ``(*batch, d)``.
+        active: which sets hold in which state, boolean ``(*batch, K + 1)``; None means all.
+
+    Raises:
+        GeometryError: when the first set is not a box or the dimensions differ.
+    """
+
+    sets: tuple[ConstraintSet, ...]
+    centre: Tensor
+    active: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if not self.sets or not isinstance(self.sets[0], Box):
+            given = [type(each).__name__ for each in self.sets]
+            raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
+        dims = [each.dim for each in self.sets] + [int(self.centre.shape[-1])]
+        if len(set(dims)) > 1:
+            raise GeometryError(
+                f"sets and centre: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
+            )
+
+    @property
+    def bounds(self) -> Box:
+        """The action bounds, stage 0."""
+        bounds = self.sets[0]
+        assert isinstance(bounds, Box)
+        return bounds
+
+    def gauges(self, direction: Tensor) -> Tensor:
+        """Return the gauge of the region after each stage, ``(K + 1, *batch)``.
+
+        The gauge of an intersection is the maximum of the gauges, so this is a running maximum; a
+        set that is not active adds nothing.
+        """
+        running = [self.sets[0].gauge(direction, self.centre)]
+        for stage in range(1, len(self.sets)):
+            running.append(torch.maximum(running[-1], self._gauge(stage, direction)))
+        return torch.stack(torch.broadcast_tensors(*running))
+
+    def outer_and_inner_gauge(self, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gauges of the action bounds and of the whole region, each ``(*batch,)``."""
+        outer = inner = self.sets[0].gauge(direction, self.centre)
+        for stage in range(1, len(self.sets)):
+            inner = torch.maximum(inner, self._gauge(stage, direction))
+        return outer, inner
+
+    def contains(self, action: Tensor) -> Tensor:
+        """Tell, with zero tolerance, whether each action lies in every active set."""
+        inside = self.sets[0].contains(action)
+        for stage in range(1, len(self.sets)):
+            inside = inside & self._unless_dropped(stage, self.sets[stage].contains(action), True)
+        return inside
+
+    def slack(self, action: Tensor) -> Tensor:
+        """Return the smallest slack of the active sets, ``(*batch,)``."""
+        least = self.sets[0].slack(action)
+        for stage in range(1, len(self.sets)):
+            slack = self._unless_dropped(stage, self.sets[stage].slack(action), torch.inf)
+            least = torch.minimum(least, slack)
+        return least
+
+    def eroded(self) -> Self:
+        """Return the region whose points, computed in its dtype, lie in this one exactly.
+
+        A dropped set is replaced by one of its family about the centre, whose gauge is finite and
+        has finite gradients; it is masked anyway, but NaN times zero would be NaN.
+        """
+        magnitude = torch.maximum(self.bounds.low.abs(), self.bounds.high.abs()).amax(-1)
+        sets: list[ConstraintSet] = []
+        for stage, each in enumerate(self.sets):
+            shrunk = each.eroded(magnitude)
+            if self.active is not None and stage > 0:
+                shrunk = shrunk.where(self.active[..., stage], each.unit_about(self.centre))
+            sets.append(shrunk)
+        return type(self)(tuple(sets), self.centre, self.active)
+
+    @classmethod
+    def build(cls, sets: Sequence[ConstraintSet], centre: Tensor | None = None) -> Self:
+        """Find centre and active flags by the lexicographic rule, highest priority first.
+
+        See `cnfp_torchrl.geometry.centres.lexicographic_centre`.
+        """
+        from cnfp_torchrl.geometry.centres import lexicographic_centre
+
+        point, active = lexicographic_centre(sets, centre)
+        return cls(tuple(sets), point, active)
+
+    def _gauge(self, stage: int, direction: Tensor) -> Tensor:
+        return self._unless_dropped(stage, self.sets[stage].gauge(direction, self.centre), 0.0)
+
+    def _unless_dropped(self, stage: int, value: Tensor, neutral: float | bool) -> Tensor:
+        if self.active is None:
+            return value
+        return torch.where(self.active[..., stage], value, neutral)

@@ -1,0 +1,179 @@
+"""The visible region: moves of a point along a straight line that touch no rectangle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.superlevel import Rows
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleRegion(ConstraintSet):
+    r"""Actions whose move, from p straight to :math:`p + step\, a`, touches no closed rectangle.
+
+    Star-shaped about 0, not convex: what a rectangle R hides is its shadow
+    :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another centre c the
+    gauge is that of the part which c sees, up to where a ray first enters a shadow; it lies in the
+    true set and is star-shaped about c, so a flow into it stays sound and exact. Gauges jump where
+    rays graze a corner: their gradient is that almost everywhere.
+
+    Args:
+        position: p, ``(*batch, d)``, in units of length. Where it lies in a rectangle the set is
+            empty.
+        rectangles: their lowest and highest corners, ``(*batch, m, 2, d)``, in units of length.
+            Infinite bounds make walls, see `walls`.
+        step: the length that an action of one moves, ``(*batch,)``, positive and finite.
+    """
+
+    position: Tensor
+    rectangles: Tensor
+    step: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"position": 1, "rectangles": 3, "step": 0}
+
+    @staticmethod
+    def walls(low: Tensor, high: Tensor) -> Tensor:
+        """Return 2d infinite rectangles, ``(*batch, 2d, 2, d)``, that enclose an arena.
+
+        Args:
+            low: the arena's lowest corner, ``(*batch, d)``.
+            high: its highest corner, ``(*batch, d)``.
+        """
+        on_axis = torch.eye(low.shape[-1], dtype=torch.bool, device=low.device)
+        below = torch.where(on_axis, low.unsqueeze(-2), torch.inf)
+        above = torch.where(on_axis, high.unsqueeze(-2), -torch.inf)
+        infinite = torch.full_like(below, torch.inf)
+        return torch.cat(
+            [torch.stack([-infinite, below], -2), torch.stack([above, infinite], -2)], -3
+        )
+
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        low, high = self.rectangles.unbind(-2)
+        nowhere = (low > high) | (low == torch.inf) | (high == -torch.inf)
+        yield "position", self.position.isinf(), "a finite position"
+        yield "rectangles", torch.stack([nowhere, nowhere], -2), "low <= high, not both infinite"
+        yield "step", (self.step <= 0) | self.step.isinf(), "a finite step > 0"
+
+    def shape_problem(self) -> str | None:
+        count, corners = self.rectangles.shape[-3:-1]
+        if count > 0 and corners == 2:
+            return None
+        return f"expected 'rectangles' (*batch, m >= 1, 2, d), given {tuple(self.rectangles.shape)}"
+
+    def contains(self, action: Tensor) -> Tensor:
+        move = (self.step.double().unsqueeze(-1) * action.double()).unsqueeze(-2)
+        low, high = (self.rectangles.double() - self.position.double()[..., None, None, :]).unbind(
+            -2
+        )
+        # Shares of the move between which it is within the rectangle's bounds on each axis.
+        still = move == 0
+        move = torch.where(still, 1.0, move)
+        enters = torch.minimum(low / move, high / move)
+        leaves = torch.maximum(low / move, high / move)
+        between = (low <= 0) & (high >= 0)
+        enters = torch.where(still, torch.where(between, -torch.inf, torch.inf), enters)
+        leaves = torch.where(still, torch.where(between, torch.inf, -torch.inf), leaves)
+        first, last = enters.amax(-1).clamp(min=0), leaves.amin(-1).clamp(max=1)
+        return (first > last).all(-1)
+
+    def slack(self, action: Tensor) -> Tensor:
+        r"""Return the distance to the nearest shadow in the largest component, signed.
+
+        :math:`\min_{\tau \ge 1} \max_i \max(\tau l_i - a_i, a_i - \tau h_i)` for a rectangle
+        [l, h] in action units: a maximum over pairs of lines in tau, one rising, one falling, of
+        where they cross, and over rising lines at tau = 1. Minus infinity inside a rectangle.
+        """
+        low, high = self._in_action_units()
+        action = action.unsqueeze(-2)
+        slope = torch.cat([low, -high], -1)
+        finite = slope.isfinite()
+        slope = torch.where(finite, slope, 0.0)
+        start = torch.cat([-action, action], -1)
+        start, slope, finite = torch.broadcast_tensors(start, slope, finite)
+        rising = finite & (slope >= 0)
+        at_one = torch.where(rising, slope + start, -torch.inf).amax(-1)
+        j, k = slope.unsqueeze(-1), slope.unsqueeze(-2)
+        pair = (finite & (slope > 0)).unsqueeze(-1) & (finite & (slope < 0)).unsqueeze(-2)
+        crossing = (j * start.unsqueeze(-2) - k * start.unsqueeze(-1)) / torch.where(pair, j - k, 1)
+        crossing = torch.where(pair, crossing, -torch.inf).amax((-2, -1))
+        return torch.maximum(at_one, crossing).amin(-1)
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        r"""Return one over the share t at which the ray c + t v first enters a shadow, or 0.
+
+        In a shadow means :math:`\tau l \le c + t v \le \tau h` for a :math:`\tau \ge 1`. Eliminating
+        :math:`\tau` (Fourier and Motzkin) leaves an interval of t, bounded by pairs of those rows.
+        """
+        low, high, v, c = torch.broadcast_tensors(
+            *self._in_action_units(), direction.unsqueeze(-2), centre.unsqueeze(-2)
+        )
+        one, zero = torch.ones_like(v[..., :1]), torch.zeros_like(v[..., :1])
+        # Rows A tau + B t + C >= 0; an infinite bound asks for nothing, so it becomes tau >= 0.
+        tau = torch.cat([-low, high], -1)
+        finite = tau.isfinite()
+        tau = torch.cat([torch.where(finite, tau, 1.0), one], -1)
+        t = torch.cat([torch.where(finite, torch.cat([v, -v], -1), 0.0), zero], -1)
+        constant = torch.cat([torch.where(finite, torch.cat([c, -c], -1), 0.0), -one], -1)
+        pair = (tau > 0).unsqueeze(-1) & (tau <= 0).unsqueeze(-2)
+        rise = tau.unsqueeze(-1) * t.unsqueeze(-2) - tau.unsqueeze(-2) * t.unsqueeze(-1)
+        level = tau.unsqueeze(-1) * constant.unsqueeze(-2) - tau.unsqueeze(-2) * constant.unsqueeze(
+            -1
+        )
+        enters, leaves = pair & (level < 0), pair & (level >= 0) & (rise < 0)
+        entry = rise.clamp(min=0) / torch.where(enters, -level, 1.0)
+        entry = torch.where(enters, entry, torch.inf).amin((-2, -1))
+        exit_ = torch.where(leaves, -rise / torch.where(leaves, level, 1.0), 0.0).amax((-2, -1))
+        return torch.where(entry >= exit_, entry, 0.0).amax(-1)
+
+    def bounding_box(self) -> Box:
+        """Return the bounds that walls set, rectangles infinite in all but one direction."""
+        low, high = self._in_action_units()
+        free = torch.cat([low.isneginf(), high.isposinf()], -1)
+        wall = free.sum(-1, keepdim=True) == 2 * self.dim - 1
+        above = torch.where(wall & low.isfinite(), low, torch.inf).amin(-2)
+        below = torch.where(wall & high.isfinite(), high, -torch.inf).amax(-2)
+        return Box(below, above, validate_args=False)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        reach = self.position.abs().amax(-1) + self.step * magnitude
+        corners = torch.where(self.rectangles.isinf(), 0.0, self.rectangles).abs().amax((-2, -1))
+        grown = eps * (reach.unsqueeze(-1) + corners).unsqueeze(-1)
+        low, high = self.rectangles.unbind(-2)
+        rectangles = torch.stack([low - grown, high + grown], -2)
+        return type(self)(self.position, rectangles, self.step, validate_args=False)
+
+    def unit_about(self, centre: Tensor) -> Self:
+        # One wall, a unit or more beyond the centre, seen from a position that the centre moves to 0.
+        low = torch.full_like(self.rectangles[..., 0, :], -torch.inf)
+        high = torch.full_like(low, torch.inf)
+        wall = (centre[..., :1].abs() + 1).unsqueeze(-2)
+        first = torch.arange(self.dim, device=low.device) == 0
+        low = torch.where(first, wall, low)
+        rectangles = torch.stack(torch.broadcast_tensors(low, high), -2)
+        return type(self)(-centre, rectangles, torch.ones_like(self.step), validate_args=False)
+
+    def superlevel(self) -> Rows:
+        """Describe a convex part: before each rectangle, the side that leaves the most room."""
+        low, high = self._in_action_units()
+        gap, side = torch.cat([low, -high], -1).max(-1)
+        identity = torch.eye(self.dim, dtype=gap.dtype, device=gap.device)
+        normals = torch.cat([identity, -identity])[side]
+        # In a rectangle the part is empty: 0 a + t <= gap < 0.
+        normals = torch.where((gap > 0).unsqueeze(-1), normals, 0.0)
+        return Rows(normals, gap, torch.ones_like(gap))
+
+    def _in_action_units(self) -> tuple[Tensor, Tensor]:
+        """Return the rectangles' corners as seen from the position, each ``(*batch, m, d)``."""
+        seen = (self.rectangles - self.position[..., None, None, :]) / self.step[
+            ..., None, None, None
+        ]
+        low, high = seen.unbind(-2)
+        return low, high

@@ -1,0 +1,32 @@
+"""TensorDictModules that give actors hard action constraints."""
+
+from cnfp_torchrl.modules.actors import (
+    constrain,
+    flow_head,
+    make_constrained_actor,
+    with_reference_entropy,
+)
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.flows import ExactFlow, Flow, PaperChain, RadialFlow, UnconstrainedFlow
+from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
+from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+
+__all__ = [
+    "ConstrainedFlowModule",
+    "ConstraintBijector",
+    "ConstraintViolationError",
+    "ExactFlow",
+    "ExecutedActionGuard",
+    "Flow",
+    "PaperChain",
+    "RadialFlow",
+    "SafeRandomPolicy",
+    "UnconstrainedFlow",
+    "WarmUpPolicy",
+    "constrain",
+    "flow_head",
+    "guarded",
+    "make_constrained_actor",
+    "with_reference_entropy",
+]

@@ -1,0 +1,116 @@
+"""The bijector of one constraint as a TensorDictModule."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+
+from cnfp_torchrl.bijectors import Bijector, paper_squash
+from cnfp_torchrl.geometry import ConstraintSet
+
+CENTRE_KEY = ("constraints", "centre")
+
+
+class ConstraintBijector(TensorDictModuleBase):
+    """Read the geometry of one constraint from a tensordict and turn it into a bijector.
+
+    An actor takes such modules and combines their sets (`ConstrainedFlowModule`). Called alone, the
+    module pushes the sample through the constraint's own squash and adds the log-determinant.
+
+    Args:
+        name: the constraint's name; its geometry lies at ``("constraints", name, FIELD)``.
+        set_type: the family of its sets, such as `cnfp_torchrl.geometry.Ball`.
+        sample_key: the sample ``(*batch, d)`` that `forward` replaces.
+        log_det_key: the log-determinant ``(*batch,)`` that `forward` adds to, from 0 if absent.
+
+    Raises:
+        TypeError: when `set_type` is no subclass of `ConstraintSet`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        set_type: type[ConstraintSet],
+        *,
+        sample_key: NestedKey = "action",
+        log_det_key: NestedKey = "log_det",
+    ) -> None:
+        super().__init__()
+        if not (isinstance(set_type, type) and issubclass(set_type, ConstraintSet)):
+            raise TypeError(
+                f"set_type of constraint '{name}': expected a subclass of ConstraintSet such as "
+                f"cnfp_torchrl.geometry.Ball, given {set_type!r}"
+            )
+        self.name = name
+        self.set_type = set_type
+        self.sample_key = sample_key
+        self.log_det_key = log_det_key
+        self.geometry_keys: list[NestedKey] = [
+            ("constraints", name, f) for f in set_type.event_dims
+        ]
+        self.in_keys = [*self.geometry_keys, sample_key]
+        self.out_keys = [sample_key, log_det_key]
+
+    @property
+    def active_key(self) -> NestedKey:
+        """Where `ConstraintCentre` says whether the constraint holds in a state."""
+        return ("constraints", self.name, "active")
+
+    def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
+        """Return the sets of allowed actions; their values were checked when published.
+
+        Raises:
+            KeyError: when the geometry is missing, naming the key.
+        """
+        values = {}
+        for key, field in zip(self.geometry_keys, self.set_type.event_dims, strict=True):
+            values[field] = tensordict.get(key, None)
+            if values[field] is None:
+                raise KeyError(
+                    f"constraint '{self.name}': expected its geometry at {key}, found keys "
+                    f"{sorted(map(str, tensordict.keys(True, True)))}; append the environment "
+                    "transform that publishes it"
+                )
+        return self.set_type(**values, validate_args=False)
+
+    def get_transform(self, tensordict: TensorDictBase) -> Bijector:
+        """Return the constraint's own squash, onto its set alone (the paper's squash)."""
+        return paper_squash(self.get_set(tensordict))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Push the sample through `get_transform` and add its log-determinant."""
+        sample, log_det = self.get_transform(tensordict).forward_and_log_det(
+            tensordict.get(self.sample_key)
+        )
+        before = tensordict.get(self.log_det_key, None)
+        tensordict.set(self.sample_key, sample)
+        tensordict.set(self.log_det_key, log_det if before is None else before + log_det)
+        return tensordict
+
+    def __repr__(self) -> str:
+        return f"ConstraintBijector({self.name!r}, {self.set_type.__name__})"
+
+
+def in_order(
+    bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None
+) -> list[ConstraintBijector]:
+    """Return the bijectors in order of application: lowest priority first, highest last.
+
+    Args:
+        bijectors: one for each constraint.
+        order: names of the constraints in order of application; None takes the bijectors' own.
+
+    Raises:
+        ValueError: when a name is unknown, missing or repeated.
+    """
+    names = [bijector.name for bijector in bijectors]
+    wanted = list(names if order is None else order)
+    if sorted(wanted) != sorted(set(names)) or len(names) != len(set(names)):
+        raise ValueError(
+            f"order: expected each of the constraints {names} exactly once, given {wanted}"
+        )
+    by_name = dict(zip(names, bijectors, strict=True))
+    return [by_name[name] for name in wanted]

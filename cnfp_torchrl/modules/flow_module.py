@@ -1,0 +1,191 @@
+"""The probabilistic head of a constrained actor: base distribution and constraint bijectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal
+from torchrl.data import Composite, TensorSpec
+from torchrl.modules import SafeProbabilisticModule
+
+from cnfp_torchrl.bijectors import Bijector
+from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
+from cnfp_torchrl.geometry import Box, Region
+from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
+from cnfp_torchrl.modules.flows import Flow, resolve_flow
+
+
+class ConstrainedFlowModule(SafeProbabilisticModule):
+    """Draw actions from a Gaussian pushed through the bijectors of all constraints.
+
+    Reads the Gaussian's parameters and, for each constraint, the geometry that the environment's
+    transforms publish; an exact flow also reads the centre and the active flags that
+    `cnfp_torchrl.envs.ConstraintCentre` computes. Ends an actor, as TorchRL's own probabilistic
+    modules do.
+
+    Args:
+        spec: the bounded action spec; its bounds are stage 0 of the flow.
+        bijectors: one `ConstraintBijector` for each constraint.
+        order: the constraints' names in order of application, the last with the highest priority;
+            None takes the bijectors' own order.
+        flow: how the sets are combined: a `Flow`, or ``exact``, ``radial``, ``squash``, ``none``.
+        in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
+        out_key: the action, ``(*batch, d)``.
+        return_log_prob: also write the action's log-density, ``(*batch,)``.
+
+    Raises:
+        ValueError: when the spec is unbounded or an order does not name each constraint once.
+    """
+
+    distribution_type: type[ConstrainedFlow] = ConstrainedFlow
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        spec: TensorSpec,
+        bijectors: Sequence[ConstraintBijector],
+        *,
+        order: Sequence[str] | None = None,
+        flow: Flow | str = "exact",
+        in_keys: Sequence[NestedKey] = ("loc", "scale"),
+        out_key: NestedKey = "action",
+        return_log_prob: bool = False,
+    ) -> None:
+        super().__init__(
+            in_keys=list(in_keys),
+            out_keys=[out_key],
+            spec=spec,
+            distribution_class=self.distribution_type,
+            default_interaction_type=InteractionType.RANDOM,
+            return_log_prob=return_log_prob,
+        )
+        bounds = action_bounds(spec, out_key)
+        self.register_buffer("low", bounds.low, persistent=False)
+        self.register_buffer("high", bounds.high, persistent=False)
+        self._bijectors = nn.ModuleList(in_order(bijectors, order))
+        self.flow = resolve_flow(flow)
+        self.parameter_keys = list(in_keys)
+        self.in_keys = [*in_keys, *self.geometry_keys()]
+
+    @property
+    def bijectors(self) -> list[ConstraintBijector]:
+        """The constraints' modules in order of application."""
+        return [cast(ConstraintBijector, module) for module in self._bijectors]
+
+    @property
+    def order(self) -> list[str]:
+        """The constraints' names in order of application."""
+        return [bijector.name for bijector in self.bijectors]
+
+    @property
+    def bounds(self) -> Box:
+        """The action bounds, stage 0."""
+        return Box(self.low, self.high, validate_args=False)
+
+    @property
+    def action_key(self) -> NestedKey:
+        """Where the action is written."""
+        return self.out_keys[0]
+
+    @property
+    def stage_names(self) -> list[str]:
+        """Names of the stages of `get_dist(...).stages`, in order of application."""
+        if self.flow.is_exact:
+            return ["bounds", *self.order]
+        return self.order if self.flow.reads_constraints and self.order else ["bounds"]
+
+    def geometry_keys(self) -> list[NestedKey]:
+        """Return the keys, besides the Gaussian's parameters, that the flow reads."""
+        if not self.flow.reads_constraints:
+            return []
+        keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
+        if self.flow.is_exact:
+            keys += [bijector.active_key for bijector in self.bijectors] + [CENTRE_KEY]
+        return keys
+
+    def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
+        """Return the bijector of the states in a tensordict.
+
+        Raises:
+            KeyError: when geometry, centre or active flags are missing, naming the key.
+        """
+        bounds = self.bounds
+        if not self.flow.reads_constraints:
+            return self.flow(bounds, [], None, None)
+        sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
+        if not self.flow.is_exact:
+            return self.flow(bounds, sets, None, None)
+        return self.flow(bounds, sets, self._centre(tensordict), self._active(tensordict))
+
+    def get_region(self, tensordict: TensorDictBase) -> Region:
+        """Return the region of allowed actions, for any flow; needs centre and active flags."""
+        sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
+        centre, active = self._centre(tensordict), self._active(tensordict)
+        return Region((self.bounds, *sets), centre, active)
+
+    def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
+        """Return the distribution over actions in the states of a tensordict."""
+        loc, scale = (tensordict.get(key) for key in self.parameter_keys)
+        base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+        return self.distribution_type(base, self.get_bijector(tensordict))
+
+    build_dist_from_params = get_dist
+
+    def _centre(self, tensordict: TensorDictBase) -> Tensor:
+        return _require(tensordict, CENTRE_KEY)
+
+    def _active(self, tensordict: TensorDictBase) -> Tensor | None:
+        if not self.bijectors:
+            return None
+        flags = [_require(tensordict, bijector.active_key) for bijector in self.bijectors]
+        return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
+
+
+class ReferenceEntropyFlowModule(ConstrainedFlowModule):
+    """The same actions, scored for losses by the reference entropy (`ReferenceEntropyFlow`)."""
+
+    distribution_type = ReferenceEntropyFlow
+
+
+def action_bounds(spec: TensorSpec, action_key: NestedKey = "action") -> Box:
+    """Return the bounds of an action spec as one box, ``(d,)``.
+
+    Args:
+        spec: a bounded spec, or a composite with one at `action_key`; batch dimensions must agree.
+        action_key: where the action lies in a composite spec.
+
+    Raises:
+        ValueError: when the spec has no finite bounds or they differ along batch dimensions.
+    """
+    leaf = spec[action_key] if isinstance(spec, Composite) else spec
+    space = getattr(leaf, "space", None)
+    low, high = getattr(space, "low", None), getattr(space, "high", None)
+    if low is None or high is None or not bool((low.isfinite() & high.isfinite()).all()):
+        raise ValueError(
+            f"spec of '{action_key}': expected a bounded action spec, given {leaf}; the action "
+            "bounds are the first stage of every flow"
+        )
+    rows = [bound.reshape(-1, bound.shape[-1]) for bound in (low, high)]
+    if any(bool((row != row[0]).any()) for row in rows):
+        raise ValueError(
+            f"spec of '{action_key}': expected the same bounds for all batch elements, given "
+            f"{leaf}; pass env.action_spec_unbatched"
+        )
+    return Box(rows[0][0].clone(), rows[1][0].clone())
+
+
+def _require(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"expected {key}, found keys {sorted(map(str, tensordict.keys(True, True)))}; append "
+            "cnfp_torchrl.envs.ConstraintCentre after the geometry transforms"
+        )
+    return value

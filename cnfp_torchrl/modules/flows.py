@@ -1,0 +1,151 @@
+"""The ways of combining the sets of all constraints into one bijector.
+
+Each is a small callable, chosen by `_target_` in ``conf/flow/`` or by its name in `constrain`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+from torch import Tensor
+
+from cnfp_torchrl.bijectors import (
+    Bijector,
+    BijectorChain,
+    BoxSquash,
+    GaugeSquash,
+    RadialSquash,
+    paper_squash,
+)
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
+
+
+class Flow(ABC):
+    """How the action bounds and the constraints' sets become one bijector."""
+
+    is_exact: ClassVar[bool]
+    """Whether every action satisfies all active constraints; then centre and flags are needed."""
+
+    reads_constraints: ClassVar[bool] = True
+    """Whether the constraints' sets are looked at."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> Bijector:
+        """Return the bijector.
+
+        Args:
+            bounds: the action bounds.
+            sets: the constraints' sets in order of application.
+            centre: a point strictly inside all active sets, ``(*batch, d)``; for exact flows.
+            active: which of bounds and sets hold, ``(*batch, K + 1)``; for exact flows.
+        """
+
+
+class ExactFlow(Flow):
+    """A tanh squash into the action bounds, then retractions into the intersection (default)."""
+
+    is_exact = True
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> GaugeSquash:
+        assert centre is not None
+        return GaugeSquash(Region((bounds, *sets), centre, active), validate_args=False)
+
+
+class RadialFlow(Flow):
+    """A radial squash straight onto the intersection; for one or two action dimensions."""
+
+    is_exact = True
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> RadialSquash:
+        assert centre is not None
+        return RadialSquash(Region((bounds, *sets), centre, active))
+
+
+class PaperChain(Flow):
+    """The paper's chain of squashes, which guarantees the last constraint only.
+
+    Args:
+        max_radius: balls are replaced by the ball of at most this radius inside them that is
+            nearest to 0; with the true radius of a permissive ball every sample would saturate the
+            tanh of a later box. In action units.
+    """
+
+    is_exact = False
+
+    def __init__(self, max_radius: float = 2.0) -> None:
+        if not max_radius > 0:
+            raise ValueError(f"max_radius: expected a number > 0, given {max_radius}")
+        self.max_radius = max_radius
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> Bijector:
+        if not sets:
+            return paper_squash(bounds)
+        return BijectorChain(
+            [
+                paper_squash(each.inner_ball(self.max_radius) if isinstance(each, Ball) else each)
+                for each in sets
+            ]
+        )
+
+
+class UnconstrainedFlow(Flow):
+    """The tanh squash into the action bounds alone, what any SAC does."""
+
+    is_exact = False
+    reads_constraints = False
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> BoxSquash:
+        return BoxSquash(bounds.low, bounds.high, validate_args=False)
+
+
+FLOWS: Mapping[str, type[Flow]] = {
+    "exact": ExactFlow,
+    "radial": RadialFlow,
+    "squash": PaperChain,
+    "none": UnconstrainedFlow,
+}
+
+
+def resolve_flow(flow: Flow | str) -> Flow:
+    """Return the flow of a name, or the flow itself.
+
+    Raises:
+        ValueError: when the name is unknown.
+    """
+    if isinstance(flow, Flow):
+        return flow
+    if flow not in FLOWS:
+        raise ValueError(f"flow: expected one of {list(FLOWS)} or a Flow, given {flow!r}")
+    return FLOWS[flow]()

@@ -1,0 +1,62 @@
+"""Random actions that satisfy the constraints: a policy, and a warm-up before a learned one."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.modules.actors import flow_head
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+
+
+class SafeRandomPolicy(TensorDictModuleBase):
+    """Push standard Gaussian noise through the flow: the safe counterpart of ``env.rand_action``.
+
+    TorchRL's own random actions are uniform over the action spec and break constraints.
+
+    Args:
+        head: the flow module of a constrained actor.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule) -> None:
+        super().__init__()
+        self.head = head
+        self.in_keys = head.geometry_keys()
+        self.out_keys = [head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write an action for every batch element."""
+        low = self.head.low
+        latent = torch.randn(*tensordict.shape, *low.shape, dtype=low.dtype, device=low.device)
+        return tensordict.set(self.head.action_key, self.head.get_bijector(tensordict)(latent))
+
+
+class WarmUpPolicy(TensorDictModuleBase):
+    """Act at random, within the constraints, for a number of frames, then with the actor.
+
+    Takes the place of a collector's ``init_random_frames``, whose actions are not constrained.
+
+    Args:
+        actor: a constrained actor.
+        frames: number of actions, over all batch elements, before the actor takes over.
+    """
+
+    def __init__(self, actor: SafeProbabilisticTensorDictSequential, frames: int) -> None:
+        super().__init__()
+        if frames < 0:
+            raise ValueError(f"frames: expected a number >= 0, given {frames}")
+        self.actor = actor
+        self.random = SafeRandomPolicy(flow_head(actor))
+        self.frames_left = frames
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action of the policy whose turn it is."""
+        if self.frames_left > 0:
+            self.frames_left -= max(tensordict.numel(), 1)
+            # The actor runs too, so that every step carries the same keys.
+            self.actor(tensordict)
+            return self.random(tensordict)
+        return self.actor(tensordict)
