@@ -1,0 +1,100 @@
+"""The transform that finds, once per state, the centre of the allowed region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import TransformedEnv, Transform
+
+from cnfp_torchrl.envs.geometry_transform import SAFE_ACTION_KEY, GeometryTransform
+from cnfp_torchrl.geometry import Box
+from cnfp_torchrl.geometry.centres import lexicographic_centre
+from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
+from cnfp_torchrl.modules.flow_module import action_bounds
+
+
+def constraint_bijectors(env: TransformedEnv) -> list[ConstraintBijector]:
+    """Return a bijector for each constraint whose geometry the environment publishes."""
+    state = env.observation_spec.zero()
+    return [
+        ConstraintBijector(transform.name, type(transform.constraint_set(state)))
+        for transform in env.transform
+        if isinstance(transform, GeometryTransform)
+    ]
+
+
+class ConstraintCentre(Transform):
+    """Publish the centre of the allowed region and which constraints hold, for exact flows.
+
+    Reads the sets that the geometry transforms before it publish, and a candidate at
+    ``("constraints", "safe_action")`` if there is one: a known safe action makes the centre cheap. It
+    is checked; where it fails, the general method decides
+    (`cnfp_torchrl.geometry.centres.lexicographic_centre`).
+
+    Writes ``("constraints", "centre")``, ``(*batch, d)``, and ``("constraints", NAME, "active")``,
+    boolean ``(*batch,)``, False where the constraint cannot hold together with those of higher
+    priority.
+
+    Args:
+        bijectors: one for each constraint; they know where the geometry lies.
+        order: the constraints' names in order of application, the last with the highest priority;
+            None takes the bijectors' own order. The same as the flow's.
+
+    Raises:
+        ValueError: when an order does not name each constraint exactly once.
+    """
+
+    def __init__(
+        self, bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None = None
+    ) -> None:
+        super().__init__()
+        self._bijectors = in_order(bijectors, order)
+        self._bounds: Box | None = None
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        sets = [bijector.get_set(next_tensordict) for bijector in self._bijectors]
+        candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
+        centre, active = lexicographic_centre([self._action_bounds(), *sets], candidate)
+        batch = next_tensordict.batch_size
+        next_tensordict.set(CENTRE_KEY, centre.expand(*batch, centre.shape[-1]))
+        for stage, bijector in enumerate(self._bijectors, start=1):
+            next_tensordict.set(bijector.active_key, active[..., stage].expand(batch))
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Fill in centre and flags of stored transitions, at root and under next."""
+        self._call(tensordict)
+        if "next" in tensordict.keys():
+            self._call(tensordict.get("next"))
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the centre and the flags."""
+        assert isinstance(observation_spec, Composite)
+        bounds, batch = self._action_bounds(), observation_spec.shape
+        observation_spec[CENTRE_KEY] = Unbounded(
+            (*batch, bounds.dim), dtype=bounds.dtype, device=observation_spec.device
+        )
+        for bijector in self._bijectors:
+            observation_spec[bijector.active_key] = Binary(
+                shape=batch, dtype=torch.bool, device=observation_spec.device
+            )
+        return observation_spec
+
+    def _action_bounds(self) -> Box:
+        if self._bounds is None:
+            if self.parent is None:
+                raise RuntimeError(
+                    "ConstraintCentre: expected to be part of an environment before use, which knows "
+                    "the action bounds; append it with TransformedEnv(env, Compose(..., this))"
+                )
+            self._bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
+        return self._bounds

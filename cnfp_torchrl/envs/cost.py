@@ -1,0 +1,150 @@
+"""The cost transform: indicators of constraint violations as one tensor, and their sum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, Transform
+
+Indicator = Callable[[TensorDictBase, TensorDictBase], Tensor]
+"""``(state and action, what the step led to) -> violated?``, bool ``(*batch,)``."""
+
+COST_KEY = "cost"
+EPISODE_COST_KEY = "episode_cost"
+
+
+class ConstraintCost(Transform):
+    """Writes the indicators at ``cost``, and their running sum in the episode at ``episode_cost``.
+
+    Both are float32 ``(*batch, K)``, one column for each name of `constraint_names`, and zero after
+    a reset. ``cost`` under ``next`` is the cost of the action beside it.
+
+    Args:
+        indicators: named indicators, for environments without costs; they see the tensordicts
+            before and after the step. None: the environment publishes ``cost`` itself.
+
+    Raises:
+        ValueError: for an indicator of the wrong shape or dtype, and where the environment's cost
+            is missing or not float32 ``(*batch, K)``.
+    """
+
+    def __init__(self, indicators: Mapping[str, Indicator] | None = None) -> None:
+        if indicators is not None and not indicators:
+            raise ValueError("indicators: expected at least one, or None, given an empty mapping")
+        super().__init__(in_keys=[COST_KEY], out_keys=[COST_KEY, EPISODE_COST_KEY])
+        self.indicators = None if indicators is None else dict(indicators)
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """The columns' names: of the indicators, or of the environment that publishes costs."""
+        if self.indicators is not None:
+            return tuple(self.indicators)
+        if self.parent is None:
+            raise RuntimeError(
+                "constraint_names: expected indicators or an environment, given neither; append "
+                "the transform to an environment first"
+            )
+        return constraint_names(self.parent)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        if self.indicators is not None:
+            shape = (*observation_spec.shape, len(self.indicators))
+            observation_spec[COST_KEY] = Bounded(
+                0.0, 1.0, shape, device=observation_spec.device, dtype=torch.float32
+            )
+        else:
+            self._require_cost(observation_spec)
+        observation_spec[EPISODE_COST_KEY] = self._sum_spec(observation_spec[COST_KEY])
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        # The sum so far is read at the root: batched environments must pass it to their workers.
+        state_spec = input_spec["full_state_spec"]
+        if state_spec is None:
+            state_spec = Composite(shape=input_spec.shape, device=input_spec.device)
+        if self.indicators is not None:
+            shape = torch.Size((*input_spec.shape, len(self.indicators)))
+        else:
+            shape = self.parent.observation_spec[COST_KEY].shape
+        state_spec[EPISODE_COST_KEY] = Unbounded(
+            shape, device=input_spec.device, dtype=torch.float32
+        )
+        input_spec["full_state_spec"] = state_spec
+        return input_spec
+
+    def _sum_spec(self, cost: Any) -> Unbounded:
+        return Unbounded(cost.shape, device=cost.device, dtype=torch.float32)
+
+    def _require_cost(self, observation_spec: Composite) -> None:
+        spec = observation_spec.get(COST_KEY, None)
+        batch = observation_spec.shape
+        if spec is None:
+            raise ValueError(
+                f"ConstraintCost(indicators=None): expected an environment that publishes "
+                f"{COST_KEY!r}, given one with {sorted(map(str, observation_spec.keys()))}; "
+                "pass indicators, or for a GymEnv call auto_register_info_dict()"
+            )
+        if spec.dtype != torch.float32 or spec.shape[:-1] != batch:
+            raise ValueError(
+                f"ConstraintCost(indicators=None), key {COST_KEY!r}: expected float32 of shape "
+                f"({tuple(batch)}, K), given {spec.dtype} of shape {tuple(spec.shape)}; pass "
+                "indicators that convert it"
+            )
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.indicators is not None:
+            next_tensordict.set(COST_KEY, self._evaluate(tensordict, next_tensordict))
+        total = tensordict.get(EPISODE_COST_KEY) + next_tensordict.get(COST_KEY)
+        return next_tensordict.set(EPISODE_COST_KEY, total)
+
+    def _evaluate(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+        assert self.indicators is not None
+        columns = []
+        for name, indicator in self.indicators.items():
+            column = indicator(tensordict, next_tensordict)
+            batch = next_tensordict.batch_size
+            if column.dtype != torch.bool or column.shape != batch:
+                raise ValueError(
+                    f"indicator '{name}': expected bool of shape {tuple(batch)}, "
+                    f"given {column.dtype} of shape {tuple(column.shape)}"
+                )
+            columns.append(column)
+        return torch.stack(columns, dim=-1).float()
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Where only some agents are reset, the caller merges: the others keep their sums.
+        zero = self.container.observation_spec[EPISODE_COST_KEY].zero()
+        if self.indicators is not None:
+            tensordict_reset.set(COST_KEY, zero.clone())
+        return tensordict_reset.set(EPISODE_COST_KEY, zero)
+
+
+def constraint_names(env: EnvBase) -> tuple[str, ...]:
+    """Return the names of the columns of an environment's ``cost``.
+
+    They are, in this order of preference: those of the last `ConstraintCost` with indicators, the
+    environment's ``constraint_names``, and those in the metadata of a wrapped Gymnasium env.
+
+    Raises:
+        ValueError: when the environment names none.
+    """
+    transforms = getattr(env, "transform", None)
+    for transform in reversed(list(transforms) if transforms is not None else []):
+        if isinstance(transform, ConstraintCost) and transform.indicators is not None:
+            return transform.constraint_names
+    names = getattr(env, "constraint_names", None) or (getattr(env, "metadata", None) or {}).get(
+        "constraint_names"
+    )
+    if not names:
+        raise ValueError(
+            f"env: expected one that names its constraints (constraint_names, or a ConstraintCost "
+            f"with indicators), given {type(env).__name__}"
+        )
+    return tuple(names)

@@ -1,0 +1,1 @@
+"""Training and evaluation: collector, replay buffer, update, log."""

@@ -1,0 +1,72 @@
+"""Environment, actor and critic of a run, assembled from its configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torchrl.envs import TransformedEnv
+from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
+
+from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.modules import Flow, make_constrained_actor
+from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.training.run_folder import RunFolder
+
+
+def build_environment(
+    config: DictConfig, *, batch_size: list[int] | None = None, with_centre: bool = False
+) -> TransformedEnv:
+    """Return the environment of a configuration.
+
+    Args:
+        config: with sections ``env`` and ``flow``.
+        batch_size: replaces the batch size of environments that have one.
+        with_centre: publish centre and active flags also where the flow does not need them.
+    """
+    flow: Flow = instantiate(config.flow.combine)
+    replaced: dict[str, Any] = {}
+    if batch_size is not None and "batch_size" in config.env.base:
+        replaced["batch_size"] = batch_size
+    return make_environment(
+        instantiate(config.env.base, **replaced, _convert_="all"),
+        {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
+        order=list(config.flow.order),
+        with_centre=with_centre or flow.is_exact,
+    )
+
+
+def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
+    """Return the actor of a configuration for an environment."""
+    observation_size = env.observation_spec["observation"].shape[-1]
+    action_size = env.action_spec_unbatched.shape[-1]
+    return make_constrained_actor(
+        instantiate(config.network.actor, observation_size, action_size),
+        env.action_spec_unbatched,
+        constraint_bijectors(env),
+        order=list(config.flow.order),
+        flow=instantiate(config.flow.combine),
+    )
+
+
+def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
+    """Return the critic of a configuration for an environment."""
+    observation_size = env.observation_spec["observation"].shape[-1]
+    action_size = env.action_spec_unbatched.shape[-1]
+    return instantiate(config.network.critic, observation_size, action_size)
+
+
+def load_actor(
+    folder: RunFolder, config: DictConfig, env: TransformedEnv
+) -> SafeProbabilisticTensorDictSequential:
+    """Return the trained actor of a run.
+
+    Args:
+        folder: the run.
+        config: its configuration, from `RunFolder.load_config`.
+        env: an environment of that configuration.
+    """
+    actor = build_actor(config, env)
+    actor.load_state_dict(folder.load_checkpoint()["actor"])
+    return actor.eval()

@@ -1,0 +1,64 @@
+"""Policies that learn nothing, to hold learned ones against."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from cnfp_torchrl.bijectors.rays import scaled_direction
+from cnfp_torchrl.envs import Layout, ShortestPath
+from cnfp_torchrl.modules import ConstrainedFlowModule
+
+
+class StandStill(TensorDictModuleBase):
+    """Always the zero action.
+
+    Args:
+        head: the flow module of an actor, which knows the action's key and size.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule) -> None:
+        super().__init__()
+        self.head = head
+        self.in_keys: list[NestedKey] = []
+        self.out_keys = [head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write zeros."""
+        zeros = self.head.low.new_zeros(*tensordict.shape, *self.head.low.shape)
+        return tensordict.set(self.head.action_key, zeros)
+
+
+class ShortestPathPolicy(TensorDictModuleBase):
+    """Full speed along the shortest path to the goal, pushed into the allowed region.
+
+    Args:
+        head: the flow module of an actor, which knows the region.
+        layout: the map of point navigation.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule, layout: Layout | None = None) -> None:
+        super().__init__()
+        self.head = head
+        self.path = ShortestPath(layout)
+        self.in_keys = ["observation", *head.geometry_keys()]
+        self.out_keys = [head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action towards the next waypoint on the way to the goal."""
+        observation = tensordict.get("observation")
+        position, goal = observation[..., :2], observation[..., 3:]
+        waypoint = self.path.to_goal(position, goal)
+        wish = (waypoint - position) / self.path.layout.step_length
+        wish = wish / wish.norm(dim=-1, keepdim=True).clamp(min=1)
+        return tensordict.set(self.head.action_key, self._push_inside(tensordict, wish))
+
+    def _push_inside(self, tensordict: TensorDictBase, wish: Tensor) -> Tensor:
+        region = self.head.get_region(tensordict).eroded()
+        offset = wish - region.centre
+        direction, _ = scaled_direction(offset)
+        _, gauge = region.outer_and_inner_gauge(direction)
+        depth = offset.abs().amax(-1) * gauge
+        return region.centre + offset / depth.clamp(min=1).unsqueeze(-1)

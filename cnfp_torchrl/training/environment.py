@@ -1,0 +1,39 @@
+"""Assembly of an environment from its base, its geometry transforms and the centre."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
+
+from cnfp_torchrl.envs import ConstraintCentre, GeometryTransform, constraint_bijectors
+
+
+def make_environment(
+    base: EnvBase,
+    geometries: Mapping[str, GeometryTransform],
+    *,
+    order: Sequence[str],
+    with_centre: bool,
+) -> TransformedEnv:
+    """Return the environment whose states carry the constraints' geometry.
+
+    Args:
+        base: the environment; if it counts violations, ``constraint_names`` names its costs.
+        geometries: one transform for each constraint, by its name.
+        order: the constraints' names in order of application.
+        with_centre: also publish centre and active flags, which exact flows need.
+
+    Raises:
+        ValueError: when a geometry publishes under another name than its own, or the order does not
+            name each constraint once.
+    """
+    for name, geometry in geometries.items():
+        if geometry.name != name:
+            raise ValueError(
+                f"env.geometry.{name}.name: expected '{name}', given '{geometry.name}'"
+            )
+    env = TransformedEnv(base, Compose(*geometries.values(), RewardSum()))
+    if with_centre:
+        env.append_transform(ConstraintCentre(constraint_bijectors(env), order))
+    return env

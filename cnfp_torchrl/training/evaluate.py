@@ -1,0 +1,89 @@
+"""Evaluate a trained run beside policies that learn nothing: the command ``cnfp-evaluate``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.modules import ConstrainedFlowModule, SafeRandomPolicy, flow_head, guarded
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.baselines import StandStill
+from cnfp_torchrl.training.evaluation import evaluate
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings
+
+
+def evaluate_run(
+    folder: RunFolder, settings: EvaluationSettings, *, trusted: tuple[str, ...] = ()
+) -> dict[str, dict[str, Any]]:
+    """Return the report of the trained policy and of each baseline.
+
+    Args:
+        folder: a finished run.
+        settings: number of episodes and the seed, the same for all.
+        trusted: see `RunFolder.load_config`.
+    """
+    config = folder.load_config(trusted)
+    env = build_environment(config, batch_size=[settings.episodes], with_centre=True)
+    actor = load_actor(folder, config, env)
+    bijectors = flow_head(actor).bijectors
+    exact = ConstrainedFlowModule(env.action_spec_unbatched, bijectors, flow="exact")
+    score = instantiate(config.env.get("score"))
+    policies: dict[str, tuple[TensorDictModuleBase, bool]] = {
+        "trained, stochastic": (guarded(actor), False),
+        "trained, deterministic": (guarded(actor), True),
+        "safe random": (SafeRandomPolicy(exact), False),
+        "standing still": (StandStill(exact), False),
+    }
+    for name, make in instantiate(config.env.get("baselines") or {}).items():
+        policies[name] = (make(exact), False)
+    reports = {}
+    for name, (policy, deterministic) in policies.items():
+        env.set_seed(settings.seed)
+        torch.manual_seed(settings.seed)
+        result = evaluate(env, policy, episodes=settings.episodes, deterministic=deterministic)
+        reports[name] = result.report(score)
+    return reports
+
+
+def table(reports: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the reports as a text table."""
+    names = list(next(iter(reports.values()))["violations"])
+    header = ["policy", "return", "score", *(f"{name} violations" for name in names)]
+    rows = [header]
+    for name, report in reports.items():
+        error = report["return_standard_error"]
+        spread = "" if error is None else f" +- {error:.2f}"
+        score = "-" if report["score"] is None else f"{report['score']:.3f}"
+        counts = [str(report["violations"][each]) for each in names]
+        rows.append([name, f"{report['return_mean']:.2f}{spread}", score, *counts])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+@hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Evaluate a run, print a table and write ``evaluation.json``."""
+    settings: EvaluationSettings = instantiate(config.evaluation)
+    trusted = tuple(config.trusted)
+    reports = evaluate_run(RunFolder.open(config.run), settings, trusted=trusted)
+    output = Path(HydraConfig.get().runtime.output_dir) / "evaluation.json"
+    document = {"run": str(config.run), "seed": settings.seed, "policies": reports}
+    output.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+    sys.stdout.write(f"{table(reports)}\n{output}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Episodes of a policy, their returns and their violations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+@dataclass(frozen=True)
+class LinearScore:
+    """A return placed on a line through two references, so that results compare.
+
+    Args:
+        zero: the return that scores 0.
+        one: the return that scores 1.
+    """
+
+    zero: float
+    one: float
+
+    def __call__(self, return_mean: float) -> float:
+        """Return the score of a mean return."""
+        return (return_mean - self.zero) / (self.one - self.zero)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What happened in a number of whole episodes.
+
+    Args:
+        returns: undiscounted return of each episode, ``(episodes,)``.
+        costs: violations of each episode by constraint, ``(episodes, K)``.
+        names: the constraints' names.
+        steps: steps taken in all.
+    """
+
+    returns: Tensor
+    costs: Tensor
+    names: tuple[str, ...]
+    steps: int
+
+    @property
+    def violations(self) -> dict[str, int]:
+        """Violating steps by constraint."""
+        totals = self.costs.sum(0).round().long().tolist()
+        return dict(zip(self.names, totals, strict=True))
+
+    def report(self, score: LinearScore | None) -> dict[str, Any]:
+        """Return the numbers as plain values."""
+        mean = float(self.returns.mean())
+        episodes = len(self.returns)
+        spread = float(self.returns.std()) / episodes**0.5 if episodes > 1 else None
+        return {
+            "return_mean": mean,
+            "return_standard_error": spread,
+            "score": None if score is None else score(mean),
+            "violations": self.violations,
+            "episodes": episodes,
+            "steps": self.steps,
+        }
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    episodes: int,
+    deterministic: bool = False,
+    max_steps: int = 10_000,
+) -> Evaluation:
+    """Run a policy for whole episodes and count.
+
+    Args:
+        env: any batch size; as many batches are run as the episodes need, the first ones count.
+        policy: writes ``action``.
+        episodes: how many.
+        deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
+        max_steps: a longer episode is an error: the environment never ends.
+
+    Raises:
+        ValueError: when `episodes` is not positive.
+        RuntimeError: when an episode outlasts `max_steps`.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes: expected a number >= 1, given {episodes}")
+    names = tuple(getattr(env, "constraint_names", None) or ())
+    mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    returns: list[Tensor] = []
+    costs: list[Tensor] = []
+    steps = 0
+    with set_exploration_type(mode):
+        while sum(len(each) for each in returns) < episodes:
+            batch_return, batch_cost, batch_steps = _run_batch(env, policy, len(names), max_steps)
+            returns.append(batch_return)
+            costs.append(batch_cost)
+            steps += batch_steps
+    return Evaluation(torch.cat(returns)[:episodes], torch.cat(costs)[:episodes], names, steps)
+
+
+def _run_batch(
+    env: EnvBase, policy: TensorDictModuleBase, constraints: int, max_steps: int
+) -> tuple[Tensor, Tensor, int]:
+    state: TensorDictBase = env.reset()
+    size = env.batch_size.numel()
+    running = torch.ones(size, dtype=torch.bool, device=state.device)
+    returns = torch.zeros(size, device=state.device)
+    costs = torch.zeros(size, constraints, device=state.device)
+    steps = 0
+    for _ in range(max_steps):
+        transition, state = env.step_and_maybe_reset(policy(state))
+        outcome = transition.get("next")
+        returns += running * outcome.get("reward").reshape(size)
+        if constraints:
+            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(size, constraints)
+        steps += int(running.sum())
+        running = running & ~outcome.get("done").reshape(size)
+        if not bool(running.any()):
+            return returns.cpu(), costs.cpu(), steps
+    raise RuntimeError(
+        f"max_steps: expected every episode to end within {max_steps} steps, but "
+        f"{int(running.sum())} of {size} go on; truncate the environment"
+    )

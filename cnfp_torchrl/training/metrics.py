@@ -1,0 +1,98 @@
+"""What a run counts and writes down while it trains."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.record.loggers import Logger
+from tqdm import tqdm
+
+
+class Metrics:
+    """Count returns and violations over a run, log scalars, and move the progress bar.
+
+    Args:
+        loggers: TorchRL loggers; each scalar goes to all of them.
+        constraint_names: names of the columns of ``cost``, none if the environment counts nothing.
+        total_frames: the length of the run, in environment steps.
+        interval: environment steps between two entries of the log.
+    """
+
+    def __init__(
+        self,
+        loggers: Iterable[Logger],
+        constraint_names: Sequence[str],
+        *,
+        total_frames: int,
+        interval: int,
+    ) -> None:
+        self.frames = 0
+        self.violations = dict.fromkeys(constraint_names, 0)
+        self._loggers = list(loggers)
+        self._interval = interval
+        self._next_log = interval
+        self._returns: list[Tensor] = []
+        self._losses: dict[str, list[Tensor]] = defaultdict(list)
+        self._last_return = math.nan
+        self._bar = tqdm(total=total_frames, unit="step", dynamic_ncols=True)
+
+    def add_steps(self, batch: TensorDictBase) -> None:
+        """Count a batch ``(steps,)`` of transitions."""
+        outcome = batch.get("next")
+        if self.violations:
+            costs = outcome.get("cost").sum(0).tolist()
+            for name, cost in zip(self.violations, costs, strict=True):
+                self.violations[name] += round(cost)
+        done = outcome.get("done").squeeze(-1)
+        if bool(done.any()):
+            self._returns.append(outcome.get("episode_reward")[done].flatten())
+        self.frames += batch.numel()
+        self._bar.update(batch.numel())
+
+    def add_losses(self, losses: TensorDictBase) -> None:
+        """Remember the losses of an update for the next entry of the log."""
+        for name, value in losses.items():
+            self._losses[name].append(value.detach())
+
+    def log_if_due(self) -> None:
+        """Write an entry of the log when the interval has passed.
+
+        Raises:
+            FloatingPointError: when a loss is not finite.
+        """
+        if self.frames < self._next_log:
+            return
+        self._next_log += self._interval
+        if self._returns:
+            self._last_return = float(torch.cat(self._returns).mean())
+            self._log("train/return", self._last_return)
+            self._returns.clear()
+        for name, count in self.violations.items():
+            self._log(f"violations/{name}", count)
+        for name, values in self._losses.items():
+            mean = float(torch.stack(values).mean())
+            if not math.isfinite(mean):
+                raise FloatingPointError(
+                    f"{name} became {mean} by step {self.frames}: the run has diverged; lower "
+                    "optim.lr, or look at the logged losses"
+                )
+            self._log(f"loss/{name.removeprefix('loss_')}", mean)
+        self._losses.clear()
+        speed = self._bar.format_dict["rate"]
+        if speed:
+            self._log("train/steps_per_second", speed)
+        total = sum(self.violations.values())
+        self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
+
+    def close(self) -> None:
+        """Finish the progress bar."""
+        self._bar.close()
+
+    def _log(self, name: str, value: float) -> None:
+        for logger in self._loggers:
+            logger.log_scalar(name, value, step=self.frames)

@@ -1,0 +1,61 @@
+"""Networks of actor and critic, from TorchRL's building blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
+
+
+def gaussian_network(
+    observation_size: int,
+    action_size: int,
+    *,
+    hidden: Sequence[int] = (256, 256),
+    scale_mapping: str = "biased_softplus_1.0",
+    scale_lb: float = 1e-4,
+) -> nn.Module:
+    """Return a network from observations to location and scale of a Gaussian over latents.
+
+    Args:
+        observation_size: number of observed numbers.
+        action_size: d.
+        hidden: widths of the hidden layers.
+        scale_mapping: how the scale is made positive, see `torchrl.modules.NormalParamExtractor`.
+        scale_lb: lower bound of the scale.
+    """
+    return nn.Sequential(
+        MLP(
+            in_features=observation_size,
+            out_features=2 * action_size,
+            num_cells=list(hidden),
+            activation_class=nn.ReLU,
+        ),
+        NormalParamExtractor(scale_mapping=scale_mapping, scale_lb=scale_lb),
+    )
+
+
+class _ActionValue(nn.Module):
+    """Feed observation and action to a network as one vector."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return self.network(torch.cat([observation, action], dim=-1))
+
+
+def action_value_network(
+    observation_size: int, action_size: int, *, hidden: Sequence[int] = (256, 256)
+) -> ValueOperator:
+    """Return a critic of ``observation`` and ``action`` that writes ``state_action_value``."""
+    network = MLP(
+        in_features=observation_size + action_size,
+        out_features=1,
+        num_cells=list(hidden),
+        activation_class=nn.ReLU,
+    )
+    return ValueOperator(_ActionValue(network), in_keys=["observation", "action"])

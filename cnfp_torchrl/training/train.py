@@ -1,0 +1,145 @@
+"""Train a policy that cannot break its constraints: the command ``cnfp-train``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.envs import constraint_names
+from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
+from cnfp_torchrl.training.agent import build_actor, build_critic, build_environment
+from cnfp_torchrl.training.evaluation import Evaluation, evaluate
+from cnfp_torchrl.training.metrics import Metrics
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings
+
+
+def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
+    """Train, evaluate and leave everything in the run's folder.
+
+    Args:
+        config: as composed from ``conf/train.yaml``.
+        folder: an empty one.
+
+    Returns:
+        The summary that is also written to ``summary.json``.
+    """
+    started = time.perf_counter()
+    settings: TrainingSettings = instantiate(config.training)
+    judgement: EvaluationSettings = instantiate(config.evaluation)
+    score = instantiate(config.env.get("score"))
+    torch.manual_seed(config.seed)
+
+    # Environment and agent
+    env = build_environment(config)
+    env.set_seed(config.seed)
+    actor = build_actor(config, env)
+    make_loss = instantiate(config.loss, _partial_=True)
+    loss = make_loss(actor, build_critic(config, env), action_spec=env.action_spec_unbatched)
+    target = instantiate(config.target, _partial_=True)(loss)
+    optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
+
+    # Data
+    policy = WarmUpPolicy(actor, settings.warmup_frames)
+    collector = instantiate(config.collector, _partial_=True)(env, policy)
+    buffer = instantiate(config.replay_buffer)
+    kept = [*actor.in_keys, "action"]
+    kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
+
+    folder.save_config(config)
+    metrics = Metrics(
+        [make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()],
+        constraint_names(env),
+        total_frames=config.collector.total_frames,
+        interval=settings.log_interval,
+    )
+
+    def update() -> TensorDictBase:
+        losses = loss(buffer.sample())
+        optimizer.zero_grad()
+        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        optimizer.step()
+        target.step()
+        return losses
+
+    owed = 0.0
+    for collected in collector:
+        batch = collected.reshape(-1)
+        metrics.add_steps(batch)
+        buffer.extend(batch.select(*kept))
+        if metrics.frames >= settings.warmup_frames:
+            owed += batch.numel() * settings.update_ratio
+            while owed >= 1:
+                metrics.add_losses(update())
+                owed -= 1
+        metrics.log_if_due()
+    metrics.close()
+    collector.shutdown()
+    folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
+
+    # Evaluation
+    results = {
+        name: _evaluate(config, actor, judgement, deterministic=name == "deterministic")
+        for name in ("stochastic", "deterministic")
+    }
+    violations = {
+        name: count + sum(result.violations[name] for result in results.values())
+        for name, count in metrics.violations.items()
+    }
+    stochastic = results["stochastic"].report(score)
+    summary = {
+        "return_mean": stochastic["return_mean"],
+        "score": stochastic["score"],
+        "violations": violations,
+        "steps": metrics.frames,
+        "seconds": time.perf_counter() - started,
+        "training_violations": metrics.violations,
+        "evaluation": {name: result.report(score) for name, result in results.items()},
+        "flow": type(flow_head(actor).flow).__name__,
+        "order": list(config.flow.order),
+        "seed": config.seed,
+    }
+    folder.save_summary(summary)
+    return summary
+
+
+def _evaluate(
+    config: DictConfig,
+    actor: SafeProbabilisticTensorDictSequential,
+    settings: EvaluationSettings,
+    *,
+    deterministic: bool,
+) -> Evaluation:
+    env = build_environment(config, batch_size=[settings.episodes])
+    env.set_seed(settings.seed)
+    return evaluate(env, guarded(actor), episodes=settings.episodes, deterministic=deterministic)
+
+
+@hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
+def main(config: DictConfig) -> float | None:
+    """Run `train` for a Hydra configuration, draw its figures and print the summary."""
+    folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
+    summary = train(config, folder)
+    if config.figures:
+        instantiate(config.figures)(folder)
+    violations = ", ".join(f"{name} {count}" for name, count in summary["violations"].items())
+    score = "" if summary["score"] is None else f", score {summary['score']:.3f}"
+    sys.stdout.write(
+        f"return {summary['return_mean']:.2f}{score}; violations: {violations or 'not counted'}; "
+        f"{summary['steps']} steps in {summary['seconds']:.0f} s\n{folder.path}\n"
+    )
+    return summary["score"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,6 @@
+"""Train a constrained policy: `python experiments/train.py key=value ...`."""
+
+from cnfp_torchrl.training.train import main
+
+if __name__ == "__main__":
+    main()

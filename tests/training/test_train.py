@@ -1,0 +1,139 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra.errors import ConfigCompositionException
+from omegaconf import DictConfig
+
+from cnfp_torchrl.envs import PointNavEnv
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.train import train
+
+Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
+
+
+def form(value: Any) -> Any:
+    """Return the keys and types of a nested result."""
+    if isinstance(value, dict):
+        return {key: form(each) for key, each in value.items()}
+    return type(value).__name__
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("entropy", ["reference", "action"])
+def test_every_flow_trains_and_reports_in_one_form(flow: str, entropy: str, tiny_run: Run) -> None:
+    folder, summary = tiny_run(f"flow={flow}", f"loss.entropy={entropy}")
+    _, reference = tiny_run()
+    assert form(summary) == form(reference)
+    assert json.loads((folder.path / "summary.json").read_text()) == summary
+    assert summary["steps"] == 192
+    assert list(summary["violations"]) == ["obstacle", "battery"]
+    if flow in ("exact", "radial"):
+        assert summary["violations"] == {"obstacle": 0, "battery": 0}
+
+
+def test_violations_are_those_the_environment_counts(
+    tiny_run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # An unconstrained agent in a small arena breaks rules at once; count them beside the trainer.
+    counted = torch.zeros(2)
+    step = PointNavEnv._step
+
+    def counting_step(self: PointNavEnv, tensordict: Any) -> Any:
+        result = step(self, tensordict)
+        counted.add_(result["cost"].reshape(-1, 2).sum(0))
+        return result
+
+    monkeypatch.setattr(PointNavEnv, "_step", counting_step)
+    _, summary = tiny_run("flow=none")
+    assert summary["violations"] == dict(zip(["obstacle", "battery"], counted.tolist(), strict=True))
+    assert summary["violations"]["obstacle"] > 0
+
+
+def test_training_changes_actor_critic_and_temperature(tiny_run: Run) -> None:
+    states = [
+        tiny_run(f"training.update_ratio={ratio}")[0].load_checkpoint()["loss"]
+        for ratio in (0.0, 0.1)
+    ]
+    for part in ("actor_network_params", "qvalue_network_params", "log_alpha"):
+        names = [name for name in states[0] if name.startswith(part) and states[0][name].numel()]
+        floating = [name for name in names if states[0][name].is_floating_point()]
+        assert floating
+        assert any(not torch.equal(states[0][name], states[1][name]) for name in floating), part
+
+
+def test_the_same_seed_gives_the_same_run(tiny_run: Run) -> None:
+    first, second, other = (tiny_run(f"seed={seed}")[1]["return_mean"] for seed in (3, 3, 4))
+    assert first == second
+    assert first != other
+
+
+def test_metrics_reach_every_logger(tiny_run: Run) -> None:
+    folder, _ = tiny_run("logger=csv_tensorboard", "env.base.max_steps=4")
+    scalars = folder.path / "metrics" / "scalars"
+    expected = ["train/return", "violations/obstacle", "violations/battery", "loss/qvalue"]
+    for name in expected:
+        rows = (scalars / f"{name}.csv").read_text().splitlines()
+        assert rows
+        step, value = rows[-1].split(",")
+        assert int(step) == 192
+        assert torch.isfinite(torch.tensor(float(value)))
+    assert list((folder.path / "tensorboard").glob("events.out.tfevents*"))
+
+
+def test_no_logger_is_fine(tiny_run: Run) -> None:
+    folder, _ = tiny_run("logger=none")
+    assert {path.name for path in folder.path.iterdir()} == {
+        "config.yaml",
+        "checkpoint.pt",
+        "summary.json",
+    }
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("flow.order=[battery]", r"order: expected each of the constraints .* given \['battery'\]"),
+        ("flow.order=[battery,obstacle,wind]", "wind"),
+        ("loss.entropy=maximal", "'reference' or 'action', given 'maximal'"),
+        ("loss.gamma=1.5", r"gamma: expected a discount in \[0, 1\), given 1.5"),
+        ("training.update_ratio=-1", "training.update_ratio: expected a number >= 0, given -1"),
+        ("training.log_interval=0", "training.log_interval: expected a number >= 1, given 0"),
+        ("evaluation.episodes=0", "evaluation.episodes: expected a number >= 1, given 0"),
+        ("env.base.collision=bounce", "bounce"),
+        ("env.layout.stations=[]", "stations"),
+        ("env.geometry.battery.name=charge", "env.geometry.battery.name: expected 'battery'"),
+        ("~env.geometry.battery", r"order: expected each of the constraints \['obstacle'\]"),
+    ],
+)
+def test_bad_configuration_is_refused_before_anything_runs(
+    override: str,
+    message: str,
+    make_config: Callable[..., DictConfig],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_step(*_: Any) -> None:
+        raise AssertionError("the environment was stepped")
+
+    monkeypatch.setattr(PointNavEnv, "_step", no_step)
+    folder = RunFolder.create(tmp_path / "run")
+    with pytest.raises(Exception, match=message):
+        train(make_config(override), folder)
+    assert not list(folder.path.iterdir())
+
+
+@pytest.mark.parametrize("override", ["flow=perfect", "flow.oder=[battery]", "sed=1"])
+def test_unknown_configuration_is_refused(
+    override: str, make_config: Callable[..., DictConfig]
+) -> None:
+    with pytest.raises(ConfigCompositionException):
+        make_config(override)
+
+
+def test_a_diverged_run_fails_loudly(tiny_run: Run) -> None:
+    with pytest.raises((FloatingPointError, ValueError), match="nan|inf"):
+        tiny_run("optim.lr=1e30", "training.update_ratio=1")
