@@ -7,10 +7,14 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import TransformedEnv, Transform
+from torchrl.envs import Transform, TransformedEnv
 
-from cnfp_torchrl.envs.geometry_transform import SAFE_ACTION_KEY, GeometryTransform
-from cnfp_torchrl.geometry import Box
+from cnfp_torchrl.envs.geometry_transform import (
+    SAFE_ACTION_KEY,
+    GeometryTransform,
+    appended_transforms,
+)
+from cnfp_torchrl.geometry import Box, GeometryError
 from cnfp_torchrl.geometry.centres import lexicographic_centre
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
 from cnfp_torchrl.modules.flow_module import action_bounds
@@ -21,7 +25,7 @@ def constraint_bijectors(env: TransformedEnv) -> list[ConstraintBijector]:
     state = env.observation_spec.zero()
     return [
         ConstraintBijector(transform.name, type(transform.constraint_set(state)))
-        for transform in env.transform
+        for transform in appended_transforms(env)
         if isinstance(transform, GeometryTransform)
     ]
 
@@ -30,8 +34,8 @@ class ConstraintCentre(Transform):
     """Publish the centre of the allowed region and which constraints hold, for exact flows.
 
     Reads the sets that the geometry transforms before it publish, and a candidate at
-    ``("constraints", "safe_action")`` if there is one: a known safe action makes the centre cheap. It
-    is checked; where it fails, the general method decides
+    ``("constraints", "safe_action")`` if there is one: a known safe action makes the centre cheap.
+    It is checked; where it fails, the general method decides
     (`cnfp_torchrl.geometry.centres.lexicographic_centre`).
 
     Writes ``("constraints", "centre")``, ``(*batch, d)``, and ``("constraints", NAME, "active")``,
@@ -55,9 +59,16 @@ class ConstraintCentre(Transform):
         self._bounds: Box | None = None
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        bounds = self._action_bounds()
         sets = [bijector.get_set(next_tensordict) for bijector in self._bijectors]
+        for bijector, each in zip(self._bijectors, sets, strict=True):
+            if each.dim != bounds.dim:
+                raise GeometryError(
+                    f"constraint '{bijector.name}': expected a set of actions with {bounds.dim} "
+                    f"components, as the action spec has, given one with {each.dim}"
+                )
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
-        centre, active = lexicographic_centre([self._action_bounds(), *sets], candidate)
+        centre, active = lexicographic_centre([bounds, *sets], candidate)
         batch = next_tensordict.batch_size
         next_tensordict.set(CENTRE_KEY, centre.expand(*batch, centre.shape[-1]))
         for stage, bijector in enumerate(self._bijectors, start=1):
@@ -72,7 +83,7 @@ class ConstraintCentre(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Fill in centre and flags of stored transitions, at root and under next."""
         self._call(tensordict)
-        if "next" in tensordict.keys():
+        if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
         return tensordict
 
@@ -93,8 +104,9 @@ class ConstraintCentre(Transform):
         if self._bounds is None:
             if self.parent is None:
                 raise RuntimeError(
-                    "ConstraintCentre: expected to be part of an environment before use, which knows "
-                    "the action bounds; append it with TransformedEnv(env, Compose(..., this))"
+                    "ConstraintCentre: expected to be part of an environment, which knows the "
+                    "action bounds, before use; append it with TransformedEnv(env, Compose(..., "
+                    "this)), and to a replay buffer a clone() of an environment's own"
                 )
             self._bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
         return self._bounds

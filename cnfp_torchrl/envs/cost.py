@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
+from cnfp_torchrl.envs.geometry_transform import appended_transforms
+
 Indicator = Callable[[TensorDictBase, TensorDictBase], Tensor]
 """``(state and action, what the step led to) -> violated?``, bool ``(*batch,)``."""
 
@@ -135,8 +137,7 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
     Raises:
         ValueError: when the environment names none.
     """
-    transforms = getattr(env, "transform", None)
-    for transform in reversed(list(transforms) if transforms is not None else []):
+    for transform in reversed(appended_transforms(env)):
         if isinstance(transform, ConstraintCost) and transform.indicators is not None:
             return transform.constraint_names
     names = getattr(env, "constraint_names", None) or (getattr(env, "metadata", None) or {}).get(

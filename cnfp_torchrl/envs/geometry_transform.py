@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import Compose, EnvBase, Transform
 
 from cnfp_torchrl.geometry import ConstraintSet, GeometryError
 
@@ -152,3 +152,11 @@ class GeometryTransform(Transform, ABC):
                 f"constraint '{self.name}', key {key!r} at index {index}: expected a finite "
                 f"number, given {value[tuple(index)].item()}"
             )
+
+
+def appended_transforms(env: EnvBase) -> list[Transform]:
+    """Return the transforms of an environment in order, none if it has none."""
+    transform = getattr(env, "transform", None)
+    if transform is None:
+        return []
+    return list(transform) if isinstance(transform, Compose) else [transform]

@@ -16,11 +16,12 @@ from cnfp_torchrl.envs.layout import EPISODE_STEPS, Layout
 
 
 class PointNavEnv(EnvBase):
-    """Navigate to goals without touching obstacles or letting the battery run low (paper, sec. 5).
+    """Navigate to goals without touching obstacles or letting the battery run low.
 
-    Episodes have no terminal state and are truncated. A reset to a chosen state, for audits and
-    pictures: ``env.reset(position=..., battery=..., goal=...)``, any of the three, broadcast over
-    the batch; what is left out is drawn.
+    The task of the paper's section Experiments, with the sizes of `Layout`. Episodes have no
+    terminal state and are truncated. A reset to a chosen state, for audits and pictures:
+    ``env.reset(position=..., battery=..., goal=...)``, any of the three, broadcast over the batch;
+    what is left out is drawn.
 
     Keys, with ``*b`` the batch size:
         - ``observation`` float32 ``(*b, 5)``: x, y, battery / 100, goal x, goal y,

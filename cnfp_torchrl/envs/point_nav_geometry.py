@@ -66,7 +66,7 @@ class ObstacleGeometry(GeometryTransform):
         self.layout = self.path.layout
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
-        """Return the box of allowed moves (method, 'What makes the zero exact')."""
+        """Return the box of allowed moves (docs/method.md, section 4)."""
         position, _ = read_observation(tensordict, self.in_keys[0])
         distance = side_distances(position, self.path.rectangles)
         separates = self.path.to_station(position).separates
@@ -121,7 +121,7 @@ class BatteryGeometry(GeometryTransform):
         self.layout = self.path.layout
 
     def constraint_set(self, tensordict: TensorDictBase) -> Ball:
-        """Return the ball of allowed moves (method, section 4 and 'What makes the zero exact')."""
+        """Return the ball of allowed moves (docs/method.md, section 4)."""
         position, battery = read_observation(tensordict, self.in_keys[0])
         way = self.path.to_station(position)
         steps_left = battery - 1 - self.layout.battery_threshold

@@ -112,6 +112,8 @@ class ShortestPath(nn.Module):
             position: ``(*batch, 2)``.
             goal: ``(*batch, 2)``.
         """
+        if len(self.corners) == 0:
+            return goal
         start, end = position.unsqueeze(-2), goal.unsqueeze(-2)
         # Corners must see the goal with something to spare: an agent near one then sees it too.
         spare = min(self.layout.start_margin, self.clearance) / 2
@@ -176,9 +178,9 @@ class ShortestPath(nn.Module):
         # per turn lets him go on there instead of stopping at it.
         inflation, turn = 0.5 * clearance, 0.5 * clearance
         edge = visible(corners.unsqueeze(-2), corners, rectangles, inflation)
-        lengths = torch.where(edge, _lengths(corners), torch.inf)
+        lengths = torch.where(edge, _lengths(corners) + turn, torch.inf).fill_diagonal_(0)
         for middle in range(len(corners)):
-            through = lengths[:, middle, None] + turn + lengths[middle, None, :]
+            through = lengths[:, middle, None] + lengths[middle, None, :]
             lengths = torch.minimum(lengths, through)
         return [("corners", corners), ("corner_lengths", lengths + turn)]
 

@@ -81,7 +81,8 @@ class Metrics:
                     f"{name} became {mean} by step {self.frames}: the run has diverged; lower "
                     "optim.lr, or look at the logged losses"
                 )
-            self._log(f"loss/{name.removeprefix('loss_')}", mean)
+            is_loss = name.startswith("loss_")
+            self._log(f"loss/{name.removeprefix('loss_')}" if is_loss else f"train/{name}", mean)
         self._losses.clear()
         speed = self._bar.format_dict["rate"]
         if speed:

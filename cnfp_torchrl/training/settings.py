@@ -19,7 +19,7 @@ class TrainingSettings:
     """
 
     warmup_frames: int = 1000
-    update_ratio: float = 1.0
+    update_ratio: float = 0.5
     log_interval: int = 500
 
     def __post_init__(self) -> None:

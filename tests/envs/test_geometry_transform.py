@@ -1,0 +1,154 @@
+"""The base of geometry transforms, through constraints that a user might write."""
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
+
+from cnfp_torchrl.envs import BatteryGeometry, GeometryTransform, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, GeometryError
+
+
+class SpeedLimit(GeometryTransform):
+    """The example of the base class's docstring, near enough."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        goal = tensordict["observation"][..., 3:]
+        return Ball(0.1 * goal, torch.ones_like(goal[..., 0]), validate_args=False)
+
+
+class Motor(GeometryTransform):
+    """The same limits in every state, without a batch."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Box:
+        return Box(torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 0.5]))
+
+
+class Wind(GeometryTransform):
+    """Of a family with a matrix, and with a safe action."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ellipsoid:
+        scale = torch.eye(2).expand(*tensordict.batch_size, 2, 2)
+        return Ellipsoid(tensordict["observation"][..., :2], scale, validate_args=False)
+
+    def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> torch.Tensor:
+        return allowed.fields()["center"]
+
+
+class Broken(GeometryTransform):
+    """Publishes whatever it is told."""
+
+    def __init__(self, value: Ball) -> None:
+        super().__init__("broken")
+        self.value = value
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        return self.value
+
+
+def env_with(*transforms: GeometryTransform, batch_size: tuple[int, ...] = (3,)) -> EnvBase:
+    env: EnvBase = TransformedEnv(PointNavEnv(batch_size, seed=0))
+    for transform in transforms:
+        env.append_transform(transform)
+    return env
+
+
+@pytest.mark.parametrize("batch_size", [(), (1,), (2, 3)])
+@pytest.mark.parametrize("transform", [SpeedLimit, Motor, Wind])
+def test_a_new_constraint_is_one_method(
+    transform: type[GeometryTransform], batch_size: tuple[int, ...]
+) -> None:
+    env = env_with(transform("mine"), batch_size=batch_size)
+    check_env_specs(env)
+    state = env.reset()
+    fields = transform("mine").constraint_set(state).fields()
+    assert set(state["constraints", "mine"].keys()) == set(fields)
+    for name, value in fields.items():
+        assert torch.equal(
+            state["constraints", "mine", name], value.expand_as(state["constraints", "mine", name])
+        )
+        assert state["constraints", "mine", name].shape[: len(batch_size)] == batch_size
+    assert (("constraints", "safe_action") in state.keys(True)) == (transform is Wind)
+
+
+def test_sets_stand_beside_each_other_and_belong_to_their_state() -> None:
+    env = env_with(ObstacleGeometry(), BatteryGeometry(), SpeedLimit("speed"))
+    rollout = env.rollout(5)
+    for data in (rollout, rollout["next"]):
+        again = SpeedLimit("speed")(data.select("observation"))
+        assert torch.equal(
+            data["constraints", "speed", "center"], again["constraints", "speed", "center"]
+        )
+    assert set(rollout["constraints"].keys()) == {"obstacle", "battery", "safe_action", "speed"}
+
+
+def test_a_replay_buffer_computes_instead_of_storing() -> None:
+    geometries = [ObstacleGeometry(), BatteryGeometry()]
+    rollout = env_with(*geometries, batch_size=()).rollout(20)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), batch_size=20)
+    buffer.extend(rollout.exclude("constraints", ("next", "constraints")))
+    for each in (ObstacleGeometry(), BatteryGeometry()):
+        buffer.append_transform(each)
+    sample = buffer.sample()
+    order = sample["index"]
+    for key in rollout["constraints"].keys(True, True):
+        key = (key,) if isinstance(key, str) else key
+        for prefix in ((), ("next",)):
+            path = (*prefix, "constraints", *key)
+            assert torch.equal(sample[path], rollout[path][order])
+
+
+@pytest.mark.parametrize("transform", [ObstacleGeometry, BatteryGeometry])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_an_observation_must_be_finite(transform: type[GeometryTransform], bad: float) -> None:
+    state = env_with().reset()
+    state["observation"][2, 3] = bad
+    message = rf"key 'observation' at index \[2, 3\]: expected a finite number, given {bad}"
+    with pytest.raises(GeometryError, match=message):
+        transform()(state)
+
+
+def test_an_observation_must_have_its_five_numbers() -> None:
+    state = TensorDict({"observation": torch.zeros(3, 4)}, batch_size=3)
+    with pytest.raises(
+        GeometryError, match=r"'observation': expected .*\(\*batch, 5\), given shape \(3, 4\)"
+    ):
+        BatteryGeometry()(state)
+
+
+def test_a_set_must_be_one() -> None:
+    center, radius = torch.zeros(3, 2), torch.ones(3)
+    for bad, message in (
+        (
+            Ball(center, -radius, validate_args=False),
+            r"'broken' .*'radius' at index \[0\].*radius > 0",
+        ),
+        (
+            Ball(center / 0, radius, validate_args=False),
+            r"'broken' .*'center' at index \[0, 0\].*a number",
+        ),
+        (
+            Ball(center, torch.ones(2), validate_args=False),
+            "'broken' .*batch shapes that broadcast",
+        ),
+        (
+            Ball(torch.zeros(4, 2), torch.ones(4)),
+            r"'broken', field 'center': .*broadcasts to \(3,\)",
+        ),
+    ):
+        with pytest.raises(GeometryError, match=message):
+            Broken(bad)(TensorDict({"observation": torch.zeros(3, 5)}, batch_size=3))
+
+
+@pytest.mark.parametrize("name", ["", "centre", "safe_action", 3])
+def test_a_constraint_needs_a_name_of_its_own(name: object) -> None:
+    with pytest.raises(ValueError, match="name: expected"):
+        SpeedLimit(name)  # type: ignore[arg-type]
+
+
+def test_names_and_keys_must_fit_the_environment() -> None:
+    with pytest.raises(ValueError, match="'same': expected to be the only one to publish"):
+        _ = env_with(SpeedLimit("same"), SpeedLimit("same")).observation_spec
+    with pytest.raises(KeyError, match=r"'far': expected to read \['lidar'\], given .*observation"):
+        _ = env_with(SpeedLimit("far", in_keys=["lidar"])).observation_spec

@@ -1,0 +1,93 @@
+"""The commands as a user types them, each in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BIN = Path(sys.executable).parent
+TINY = [
+    "collector.total_frames=96",
+    "training.warmup_frames=48",
+    "training.update_ratio=0.05",
+    "evaluation.episodes=2",
+    "+env.base.max_steps=5",
+    "logger=csv",
+    "figures=none",
+]
+
+
+def run(cwd: Path, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [BIN / command, *arguments],
+        cwd=cwd,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Train twice in one place."""
+    place = tmp_path_factory.mktemp("runs")
+    for _ in range(2):
+        done = run(place, "cnfp-train", *TINY)
+        assert done.returncode == 0, done.stderr
+        assert "violations: obstacle 0, battery 0" in done.stdout
+    return place
+
+
+def test_a_second_run_has_a_folder_of_its_own(folder: Path) -> None:
+    assert len(list(folder.glob("outputs/*/*/summary.json"))) == 2
+
+
+def test_everything_of_a_run_is_in_its_folder(folder: Path) -> None:
+    (place, _) = folder.glob("outputs/*/*/")
+    names = {path.name for path in place.iterdir()}
+    assert names >= {"config.yaml", "checkpoint.pt", "summary.json", "metrics", ".hydra"}
+    assert [path.name for path in folder.iterdir()] == ["outputs"]
+
+
+def test_evaluate_prints_a_table_and_writes_it(folder: Path, tmp_path: Path) -> None:
+    (place, _) = folder.glob("outputs/*/*/")
+    done = run(tmp_path, "cnfp-evaluate", f"run={place}", "evaluation.episodes=3")
+    assert done.returncode == 0, done.stderr
+    for name in ("trained, stochastic", "trained, deterministic", "safe random", "shortest path"):
+        assert name in done.stdout
+    (result,) = tmp_path.glob("outputs/evaluations/*/*/evaluation.json")
+    policies = json.loads(result.read_text())["policies"]
+    assert policies["trained, stochastic"]["violations"] == {"obstacle": 0, "battery": 0}
+    assert policies["trained, stochastic"]["episodes"] == 3
+
+
+def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
+    done = run(tmp_path, "cnfp-train", "-m", "seed=0,1", "flow=exact,squash", *TINY)
+    assert done.returncode == 0, done.stderr
+    summaries = [json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")]
+    jobs = {(summary["seed"], summary["flow"]) for summary in summaries}
+    assert jobs == {(seed, flow) for seed in (0, 1) for flow in ("ExactFlow", "PaperChain")}
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("cnfp-train", ["flow=perfect"], "exact"),
+        ("cnfp-train", ["flow.order=[battery,wind]"], "wind"),
+        ("cnfp-train", ["nonsense=1"], "nonsense"),
+        ("cnfp-evaluate", [], "run"),
+        ("cnfp-evaluate", ["run=/absent"], "/absent"),
+    ],
+)
+def test_wrong_input_is_explained(
+    command: str, arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    done = run(tmp_path, command, *arguments)
+    assert done.returncode != 0
+    assert message in done.stderr
+    assert not list(tmp_path.rglob("checkpoint.pt"))
