@@ -119,7 +119,7 @@ class ReferenceEntropyFlow(ConstrainedFlow):
 
     `rsample_and_log_prob` and `sample_and_log_prob` leave the retractions' :math:`d \log s` out, so
     that the negative mean is the entropy of the tanh-squashed base in the action bounds, for which
-    the usual target entropy -d is right and whose gradient is bounded (`method.md`, section 2,
+    the usual target entropy -d is right and whose gradient is bounded (`docs/method.md`, section 2,
     Entropy). For losses only; `log_prob` remains the true density.
     """
 

@@ -9,6 +9,7 @@ from cnfp_torchrl.bijectors.gauge_squash import GaugeSquash
 from cnfp_torchrl.bijectors.paper_squash import paper_squash
 from cnfp_torchrl.bijectors.radial_squash import RadialSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
+from cnfp_torchrl.bijectors.shell_squash import ShellSquash
 
 __all__ = [
     "BallSquash",
@@ -19,6 +20,7 @@ __all__ = [
     "GaugeSquash",
     "RadialSquash",
     "Retraction",
+    "ShellSquash",
     "Stages",
     "paper_squash",
 ]

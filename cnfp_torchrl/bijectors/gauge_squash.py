@@ -7,7 +7,7 @@ from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.box_squash import BoxSquash
-from cnfp_torchrl.bijectors.rays import region_shape, scale_about, scaled_direction
+from cnfp_torchrl.bijectors.rays import region_shape, scale_about, scaled_direction, share_of
 from cnfp_torchrl.geometry import Region
 
 
@@ -21,8 +21,8 @@ class GaugeSquash(Bijector):
     :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| + d \log s`.
 
     Where nothing binds, s = 1 and the action is that of a tanh-squashed Gaussian. The log-density
-    has no limit at the centre, where its gradient grows like :math:`1/|v|` (`method.md`, section
-    2). The image is the region eroded by rounding error: saturated samples satisfy every active
+    has no limit at the centre, where its gradient grows like :math:`1/|v|` (`docs/method.md`).
+    The image is the region eroded by rounding error: saturated samples satisfy every active
     constraint with zero tolerance.
 
     Args:
@@ -68,11 +68,11 @@ class GaugeSquash(Bijector):
         bounded, log_det = self._box.forward_and_log_det(latent)
         direction, zero = scaled_direction(bounded - self.region.centre)
         gauges = self.region.gauges(direction)
-        shares = torch.where(zero, 1.0, gauges[0] / gauges)
+        shares = share_of(gauges[0], gauges, zero)
         actions = scale_about(self.region.centre, bounded, shares)
         return Stages(actions, log_det + latent.shape[-1] * shares.log())
 
     def _share(self, offset: Tensor) -> Tensor:
         direction, zero = scaled_direction(offset)
         outer, inner = self.region.outer_and_inner_gauge(direction)
-        return torch.where(zero, 1.0, outer / inner)
+        return share_of(outer, inner, zero)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import singledispatch
+from collections.abc import Callable
 
 from cnfp_torchrl.bijectors.ball_squash import BallSquash
 from cnfp_torchrl.bijectors.bijector import Bijector
@@ -10,31 +10,26 @@ from cnfp_torchrl.bijectors.box_squash import BoxSquash
 from cnfp_torchrl.bijectors.ellipsoid_squash import EllipsoidSquash
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid
 
+PAPER_SQUASHES: dict[type[ConstraintSet], Callable[..., Bijector]] = {
+    Box: BoxSquash,
+    Ball: BallSquash,
+    Ellipsoid: EllipsoidSquash,
+}
+"""Families and their squashes, which take the family's fields; other families may be added."""
 
-@singledispatch
+
 def paper_squash(constraint_set: ConstraintSet) -> Bijector:
     """Return the paper's analytic squash of R^d onto one set, without checking its fields.
 
     Raises:
         TypeError: when the family has none; `GaugeSquash` handles every family.
     """
-    known = [kind.__name__ for kind in paper_squash.registry if kind is not object]
-    raise TypeError(
-        f"expected a set with a squash of its own, one of {known}, given "
-        f"{type(constraint_set).__name__}; use the exact flow (flow=exact)"
-    )
-
-
-@paper_squash.register
-def _(constraint_set: Box) -> Bijector:
-    return BoxSquash(constraint_set.low, constraint_set.high, validate_args=False)
-
-
-@paper_squash.register
-def _(constraint_set: Ball) -> Bijector:
-    return BallSquash(constraint_set.center, constraint_set.radius, validate_args=False)
-
-
-@paper_squash.register
-def _(constraint_set: Ellipsoid) -> Bijector:
-    return EllipsoidSquash(constraint_set.center, constraint_set.scale_tril, validate_args=False)
+    # A plain look-up, because torch.compile cannot trace functools.singledispatch.
+    squash = PAPER_SQUASHES.get(type(constraint_set))
+    if squash is None:
+        raise TypeError(
+            "expected a set with a squash of its own, one of "
+            f"{[family.__name__ for family in PAPER_SQUASHES]}, given "
+            f"{type(constraint_set).__name__}; use the exact flow (flow=exact)"
+        )
+    return squash(**constraint_set.fields(), validate_args=False)

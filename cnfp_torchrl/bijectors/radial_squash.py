@@ -20,7 +20,7 @@ class RadialSquash(Bijector):
     :math:`\log|\det| = -d \log g(u) + L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)`: the squash into
     the unit ball, then each ray is stretched to the boundary. Exact in any dimension, useful in one
     or two: the length of a Gaussian in R^d is near :math:`\sqrt d`, so in many dimensions all
-    samples land on the boundary (`method.md`, section 2).
+    samples land on the boundary (`docs/method.md`, section 2).
 
     Args:
         region: sets, centre and active flags, ``(*batch,)`` of them.

@@ -44,6 +44,16 @@ def set_batch_shape(each: ConstraintSet) -> torch.Size:
     return broadcast_shape(*(shape[: len(shape) - dims] for shape, dims in fields))
 
 
+def share_of(outer: Tensor, inner: Tensor, zero: Tensor) -> Tensor:
+    """Return the share ``outer / inner`` of a ray that remains, from the gauges of its direction.
+
+    Where the inner gauge is the outer one, the share is 1 with a gradient of 0, and not with the
+    difference of two equal terms, which would be rounding error over the ray's length. A gauge that
+    is NaN makes the share NaN: a broken constraint must not pass for one that does not bind.
+    """
+    return torch.where(zero | (inner == outer), 1.0, outer / inner)
+
+
 def is_inside(offset: Tensor, gauge: Tensor, zero: Tensor) -> Tensor:
     """Tell whether an offset stays short of the boundary, given the gauge of its direction."""
     return (offset.abs().amax(-1) * gauge < 1) | zero

@@ -11,6 +11,7 @@ from cnfp_torchrl.bijectors.rays import (
     scale_about,
     scaled_direction,
     set_batch_shape,
+    share_of,
 )
 from cnfp_torchrl.geometry import ConstraintSet
 
@@ -59,7 +60,7 @@ class Retraction(Bijector):
     def _share(self, offset: Tensor) -> Tensor:
         direction, zero = scaled_direction(offset)
         outer, inner = self._gauges(direction)
-        return torch.where(zero, 1.0, outer / inner)
+        return share_of(outer, inner, zero)
 
     def _gauges(self, direction: Tensor) -> tuple[Tensor, Tensor]:
         outer = self._outer.gauge(direction, self._centre)

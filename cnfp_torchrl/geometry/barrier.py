@@ -8,21 +8,21 @@ Convex Optimization, 2004, theorem 4.2.7).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.slack_program import Point, Program, weigh
+from cnfp_torchrl.geometry.slack_program import Distances, Point, Program, weigh
 
-MAX_ITERATIONS = 500
-"""Newton steps before the method gives up with an error; some 30 are usual."""
+MAX_ITERATIONS = 1000
+"""Newton steps before the method gives up with an error; some 20 are usual, 100 rare."""
 
 RELATIVE_GAP = 1e-9
 """How close bounds of the best slack come, relative to the scale, before they count as equal."""
 
-_GROWTH = 20.0
-_STEP_SHARES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+_GROWTH = 5.0
+_TRIALS = 8
 
 
 class Best(NamedTuple):
@@ -59,7 +59,8 @@ def maximise_slack(
     left = torch.arange(len(start), device=start.device)
     for _ in range(MAX_ITERATIONS):
         move, squared = newton(problem, at, eta)
-        decrement = squared.clamp(min=0).sqrt()
+        # The absolute value, because a negative one is all rounding error.
+        decrement = squared.abs().sqrt()
         near = decrement < 0.5
         gap = (nu + (decrement + nu.sqrt()) * decrement / (1 - decrement)) / eta
         upper = torch.where(near, at.slack + gap, torch.inf)
@@ -84,9 +85,7 @@ def maximise_slack(
     )
 
 
-def is_settled(
-    lower: Tensor, upper: Tensor, scale: Tensor, enough: float, share: float
-) -> Tensor:
+def is_settled(lower: Tensor, upper: Tensor, scale: Tensor, enough: float, share: float) -> Tensor:
     """Tell whether bounds of the best slack say all that is asked, or cannot come much closer."""
     gap = upper - lower
     deep = (lower >= enough) & (gap <= (1 - share) * upper.abs())
@@ -94,68 +93,95 @@ def is_settled(
 
 
 def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
-    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement."""
-    dim = at.action.shape[-1]
-    s = problem.distances(at)
+    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``."""
+    distances = problem.distances(at)
+    gradient, hessian = _rows_and_cones(problem, at, distances)
+    gradient[:, -1] -= eta
+    sums = _KinkedSums.at(problem, distances)
+    own, eliminated = sums.gradients()
+    hessian = hessian + sums.reduced_hessian()
+    move = -_solve(hessian, gradient + own - eliminated)
+    terms = sums.move_of_terms(move)
+    decrement = -((gradient + own) * move).sum(-1) - (sums.gradient * terms).sum((-2, -1))
+    return Point(move[:, :-1], move[:, -1], terms), decrement
 
-    # Rows: sums of n n^T / s^2 in (action, slack).
-    inverse = weigh(problem.row_weights, s.rows, torch.reciprocal)
-    normals = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1)
-    gradient = (normals * inverse.unsqueeze(-1)).sum(-2)
-    scaled = normals * inverse.unsqueeze(-1)
-    hessian = scaled.mT @ scaled
 
-    # Cones: -log(h^2 - |y|^2).
+def _rows_and_cones(problem: Program, at: Point, s: Distances) -> tuple[Tensor, Tensor]:
+    """Return gradient and Hessian in (action, slack) of the barriers of rows and cones."""
+    inverse = weigh(problem.row_weights, s.rows, torch.reciprocal).unsqueeze(-1)
+    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
+    # Cones: -log(h^2 - |y|^2), with z half of its gradient times h^2 - |y|^2.
     white = problem.white(at.action)
     height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    inverse = weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
+    inverse = 2 * weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
     pulled = (problem.matrices * white.unsqueeze(-1)).sum(-2)
     z = torch.cat([pulled, (height * problem.cone_rates).unsqueeze(-1)], -1)
-    z = z * (2 * inverse).unsqueeze(-1)
-    gradient = gradient + z.sum(-2)
-    hessian = hessian + z.mT @ z
-    scaled = problem.matrices * (2 * inverse).sqrt()[..., None, None]
-    scaled = scaled.flatten(1, 2)
-    hessian[:, :dim, :dim] += scaled.mT @ scaled
-    hessian[:, dim, dim] -= (2 * inverse * problem.cone_rates.square()).sum(-1)
+    z = z * inverse.unsqueeze(-1)
+    gradient = rows.sum(-2) + z.sum(-2)
+    hessian = rows.mT @ rows + z.mT @ z
+    matrices = (problem.matrices * inverse.sqrt()[..., None, None]).flatten(1, 2)
+    hessian[:, :-1, :-1] += matrices.mT @ matrices
+    hessian[:, -1, -1] -= (inverse * problem.cone_rates.square()).sum(-1)
+    return gradient, hessian
 
-    # Kinked sums: each term's bound u_i is eliminated, which leaves a diagonal and one row.
-    weights = problem.sum_weights.unsqueeze(-1)
-    p = weigh(weights, s.upper, torch.reciprocal)
-    q = weigh(weights, s.lower, torch.reciprocal)
-    r = weigh(problem.sum_weights, s.sums, torch.reciprocal)
-    curvature = torch.where(weights > 0, p.square() + q.square(), 1.0)
-    spread = (weights / curvature).sum(-1)
-    mean = (problem.upper * p.square() + problem.lower * q.square()) / curvature
-    kappa = r.square() / (1 + r.square() * spread)
-    term_gradient = r.unsqueeze(-1) - p - q
-    relaxed = term_gradient / curvature
-    # (D + r^2 1 1^T)^-1 g, by Sherman and Morrison.
-    relaxed = relaxed - (kappa * relaxed.sum(-1)).unsqueeze(-1) * weights / curvature
-    row = torch.cat([mean, problem.sum_rates.unsqueeze(-1)], -1)
-    diagonal = (p * q * (problem.upper - problem.lower)).square() / curvature
-    gradient[:, :dim] += (problem.upper * p + problem.lower * q).sum(-2)
-    gradient[:, dim] += (problem.sum_rates * r).sum(-1)
-    # Minus H_xu H_uu^-1 g_u: what the eliminated bounds leave behind.
-    curved = (problem.upper * p.square() + problem.lower * q.square()) * relaxed
-    reduced = gradient.clone()
-    reduced[:, :dim] += curved.sum(-2)
-    reduced[:, dim] -= (problem.sum_rates * r.square() * relaxed.sum(-1)).sum(-1)
-    reduced[:, dim] -= eta
-    gradient[:, dim] -= eta
-    hessian = hessian + (row * kappa.unsqueeze(-1)).mT @ row
-    hessian[:, :dim, :dim] += torch.diag_embed(diagonal.sum(-2))
 
-    move = -_solve(hessian, reduced)
-    d_action, d_slack = move[:, :dim], move[:, dim]
-    # H_uu du = -(g_u + H_ux dx)
-    pull = (problem.upper * p.square() + problem.lower * q.square()) * d_action.unsqueeze(-2)
-    pull = pull - (problem.sum_rates * r.square() * d_slack.unsqueeze(-1)).unsqueeze(-1)
-    d_terms = (pull - term_gradient) / curvature
-    d_terms = d_terms - (kappa * d_terms.sum(-1)).unsqueeze(-1) * weights / curvature
-    d_terms = d_terms * weights
-    decrement = -(gradient * move).sum(-1) - (term_gradient * d_terms).sum((-2, -1))
-    return Point(d_action, d_slack, d_terms), decrement
+class _KinkedSums(NamedTuple):
+    """Barriers of kinked sums, whose terms' bounds u are eliminated: diagonal plus rank one.
+
+    The Hessian in u is ``diag(curvature) + r^2 1 1^T``, that of u and the action ``-diag(pull)``,
+    that of u and the slack ``r^2 rates``.
+    """
+
+    problem: Program
+    p: Tensor
+    q: Tensor
+    r: Tensor
+    curvature: Tensor
+    pull: Tensor
+    gradient: Tensor
+    kappa: Tensor
+
+    @classmethod
+    def at(cls, problem: Program, s: Distances) -> Self:
+        weights = problem.sum_weights.unsqueeze(-1)
+        p = weigh(weights, s.upper, torch.reciprocal)
+        q = weigh(weights, s.lower, torch.reciprocal)
+        r = weigh(problem.sum_weights, s.sums, torch.reciprocal)
+        curvature = torch.where(weights > 0, p.square() + q.square(), 1.0)
+        kappa = r.square() / (1 + r.square() * curvature.reciprocal().sum(-1))
+        pull = problem.upper * p.square() + problem.lower * q.square()
+        return cls(problem, p, q, r, curvature, pull, r.unsqueeze(-1) - p - q, kappa)
+
+    def solve(self, right: Tensor) -> Tensor:
+        """Solve with the Hessian in u, by Sherman and Morrison."""
+        scaled = right / self.curvature
+        return scaled - (self.kappa * scaled.sum(-1)).unsqueeze(-1) / self.curvature
+
+    def gradients(self) -> tuple[Tensor, Tensor]:
+        """Return the gradient in (action, slack), and what elimination takes off it."""
+        upper, lower, rates = self.problem.upper, self.problem.lower, self.problem.sum_rates
+        own = _joined((upper * self.p + lower * self.q).sum(-2), (rates * self.r).sum(-1))
+        relaxed = self.solve(self.gradient)
+        slack = (rates * self.r.square() * relaxed.sum(-1)).sum(-1)
+        return own, _joined(-(self.pull * relaxed).sum(-2), slack)
+
+    def reduced_hessian(self) -> Tensor:
+        """Return the Schur complement in (action, slack)."""
+        spread = self.p * self.q * (self.problem.upper - self.problem.lower)
+        row = _joined(self.pull / self.curvature, self.problem.sum_rates)
+        diagonal = (spread.square() / self.curvature).sum(-2)
+        diagonal = _joined(diagonal, torch.zeros_like(diagonal[:, 0]))
+        return torch.diag_embed(diagonal) + (row * self.kappa.unsqueeze(-1)).mT @ row
+
+    def move_of_terms(self, move: Tensor) -> Tensor:
+        """Return the Newton direction of u that goes with one of (action, slack)."""
+        slack = self.problem.sum_rates * self.r.square() * move[:, -1:]
+        pulled = self.pull * move[:, None, :-1] - slack.unsqueeze(-1)
+        return self.solve(pulled - self.gradient)
+
+
+def _joined(action: Tensor, slack: Tensor) -> Tensor:
+    return torch.cat([action, slack.unsqueeze(-1)], -1)
 
 
 def _pull_on_slack(problem: Program, at: Point) -> Tensor:
@@ -168,11 +194,9 @@ def _pull_on_slack(problem: Program, at: Point) -> Tensor:
 
 
 def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decrement: Tensor) -> Point:
-    """Take the best of a few steps; the damped Newton step, the first, always makes progress."""
-    damped = 1 / (1 + decrement)
-    shares = torch.tensor(_STEP_SHARES, dtype=eta.dtype, device=eta.device)
-    steps = damped * shares.unsqueeze(-1)
-    steps = torch.cat([steps, torch.ones_like(damped).unsqueeze(0)])
+    """Take the best step between the damped Newton step, which always helps, and a full one."""
+    share = torch.linspace(1, 0, _TRIALS, dtype=eta.dtype, device=eta.device).unsqueeze(-1)
+    steps = (1 + decrement) ** -share
     trials = at.moved(move, steps)
     value = problem.barrier(trials) - eta * (steps * move.slack)
     best = steps.gather(0, value.argmin(0, keepdim=True)).squeeze(0)

@@ -141,7 +141,7 @@ class ConstraintSet(ABC):
 
         def chosen(field: Tensor, event_dims: int) -> Tensor:
             event = field.shape[field.ndim - event_dims :]
-            return field.expand(*batch_shape, *event).reshape(-1, *event)[index]
+            return field.expand((*batch_shape, *event)).reshape(-1, *event)[index]
 
         return self.with_fields(chosen)
 
@@ -180,8 +180,9 @@ class ConstraintSet(ABC):
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
                 given = dtypes[name] or type(value).__name__
                 raise GeometryError(
-                    f"{where}, field '{name}': expected a float32 or float64 tensor, given {given}; "
-                    "convert it (half precision cannot hold a boundary with zero tolerance)"
+                    f"{where}, field '{name}': expected a float32 or float64 tensor, given "
+                    f"{given}; convert it (half precision cannot hold a boundary with zero "
+                    "tolerance)"
                 )
             if value.ndim < self.event_dims[name]:
                 raise GeometryError(
@@ -197,7 +198,8 @@ class ConstraintSet(ABC):
         }
         if len(set(widths.values())) > 1 or 0 in widths.values():
             raise GeometryError(
-                f"{where}: expected fields of one action dimension d >= 1, given last sizes {widths}"
+                f"{where}: expected fields of one action dimension d >= 1, given last sizes "
+                f"{widths}"
             )
         problem = self.shape_problem()
         if problem is not None:

@@ -16,8 +16,8 @@ from cnfp_torchrl.geometry.kinked_sum import KinkedSumBound
 class PositivePart(KinkedSumBound):
     r"""The unbounded set :math:`\{a : \sum_i \max(weights_i a_i, 0) \le bound\}`.
 
-    With joint velocities as weights and torques as actions it limits the power that the joints draw;
-    power that they return does not count.
+    With joint velocities as weights and torques as actions it limits the power that the joints
+    draw; power that they return does not count.
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.

@@ -19,10 +19,11 @@ class VisibleRegion(ConstraintSet):
     r"""Actions whose move, from p straight to :math:`p + step\, a`, touches no closed rectangle.
 
     Star-shaped about 0, not convex: what a rectangle R hides is its shadow
-    :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another centre c the
-    gauge is that of the part which c sees, up to where a ray first enters a shadow; it lies in the
-    true set and is star-shaped about c, so a flow into it stays sound and exact. Gauges jump where
-    rays graze a corner: their gradient is that almost everywhere.
+    :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another centre c
+    the gauge is that of the part which c sees, up to where a ray first enters a shadow; it lies in
+    the true set and is star-shaped about c, so a flow into it stays sound and exact. Gauges jump
+    where rays graze a corner: the density is exact almost everywhere, a pathwise gradient leaves
+    the jumps out.
 
     Args:
         position: p, ``(*batch, d)``, in units of length. Where it lies in a rectangle the set is
@@ -57,8 +58,14 @@ class VisibleRegion(ConstraintSet):
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         low, high = self.rectangles.unbind(-2)
         nowhere = (low > high) | (low == torch.inf) | (high == -torch.inf)
+        everywhere = (low.isinf() & high.isinf()).all(-1, keepdim=True).expand_as(low)
         yield "position", self.position.isinf(), "a finite position"
-        yield "rectangles", torch.stack([nowhere, nowhere], -2), "low <= high, not both infinite"
+        yield (
+            "rectangles",
+            torch.stack([nowhere, nowhere], -2),
+            "low <= high, not the same infinity",
+        )
+        yield "rectangles", torch.stack([everywhere, everywhere], -2), "a finite bound"
         yield "step", (self.step <= 0) | self.step.isinf(), "a finite step > 0"
 
     def shape_problem(self) -> str | None:
@@ -69,9 +76,8 @@ class VisibleRegion(ConstraintSet):
 
     def contains(self, action: Tensor) -> Tensor:
         move = (self.step.double().unsqueeze(-1) * action.double()).unsqueeze(-2)
-        low, high = (self.rectangles.double() - self.position.double()[..., None, None, :]).unbind(
-            -2
-        )
+        seen = self.rectangles.double() - self.position.double()[..., None, None, :]
+        low, high = seen.unbind(-2)
         # Shares of the move between which it is within the rectangle's bounds on each axis.
         still = move == 0
         move = torch.where(still, 1.0, move)
@@ -108,8 +114,9 @@ class VisibleRegion(ConstraintSet):
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
         r"""Return one over the share t at which the ray c + t v first enters a shadow, or 0.
 
-        In a shadow means :math:`\tau l \le c + t v \le \tau h` for a :math:`\tau \ge 1`. Eliminating
-        :math:`\tau` (Fourier and Motzkin) leaves an interval of t, bounded by pairs of those rows.
+        In a shadow means :math:`\tau l \le c + t v \le \tau h` for a :math:`\tau \ge 1`.
+        Eliminating :math:`\tau` (Fourier and Motzkin) leaves an interval of t, bounded by pairs of
+        those rows.
         """
         low, high, v, c = torch.broadcast_tensors(
             *self._in_action_units(), direction.unsqueeze(-2), centre.unsqueeze(-2)
@@ -121,16 +128,17 @@ class VisibleRegion(ConstraintSet):
         tau = torch.cat([torch.where(finite, tau, 1.0), one], -1)
         t = torch.cat([torch.where(finite, torch.cat([v, -v], -1), 0.0), zero], -1)
         constant = torch.cat([torch.where(finite, torch.cat([c, -c], -1), 0.0), -one], -1)
-        pair = (tau > 0).unsqueeze(-1) & (tau <= 0).unsqueeze(-2)
-        rise = tau.unsqueeze(-1) * t.unsqueeze(-2) - tau.unsqueeze(-2) * t.unsqueeze(-1)
-        level = tau.unsqueeze(-1) * constant.unsqueeze(-2) - tau.unsqueeze(-2) * constant.unsqueeze(
-            -1
-        )
-        enters, leaves = pair & (level < 0), pair & (level >= 0) & (rise < 0)
+        j, k = tau.unsqueeze(-1), tau.unsqueeze(-2)
+        pair = (j > 0) & (k <= 0)
+        rise = j * t.unsqueeze(-2) - k * t.unsqueeze(-1)
+        level = j * constant.unsqueeze(-2) - k * constant.unsqueeze(-1)
+        # Pairs ask for rise t + level >= 0. Those that fail at t = 0 tell where the ray enters, if
+        # they ever hold; any that fails there tells that it passes by.
+        enters = pair & (level < 0)
         entry = rise.clamp(min=0) / torch.where(enters, -level, 1.0)
         entry = torch.where(enters, entry, torch.inf).amin((-2, -1))
-        exit_ = torch.where(leaves, -rise / torch.where(leaves, level, 1.0), 0.0).amax((-2, -1))
-        return torch.where(entry >= exit_, entry, 0.0).amax(-1)
+        passes = pair & (level >= 0) & (rise + level * entry[..., None, None] < 0)
+        return torch.where(passes.any(-1).any(-1), 0.0, entry).amax(-1)
 
     def bounding_box(self) -> Box:
         """Return the bounds that walls set, rectangles infinite in all but one direction."""
@@ -151,7 +159,7 @@ class VisibleRegion(ConstraintSet):
         return type(self)(self.position, rectangles, self.step, validate_args=False)
 
     def unit_about(self, centre: Tensor) -> Self:
-        # One wall, a unit or more beyond the centre, seen from a position that the centre moves to 0.
+        # One wall, a unit or more beyond 0, which the centre moves the position to.
         low = torch.full_like(self.rectangles[..., 0, :], -torch.inf)
         high = torch.full_like(low, torch.inf)
         wall = (centre[..., :1].abs() + 1).unsqueeze(-2)
@@ -172,8 +180,9 @@ class VisibleRegion(ConstraintSet):
 
     def _in_action_units(self) -> tuple[Tensor, Tensor]:
         """Return the rectangles' corners as seen from the position, each ``(*batch, m, d)``."""
-        seen = (self.rectangles - self.position[..., None, None, :]) / self.step[
-            ..., None, None, None
-        ]
-        low, high = seen.unbind(-2)
+        # Infinite bounds stay out of the arithmetic, whose gradient would be 0 times infinity.
+        finite = self.rectangles.isfinite()
+        corners = torch.where(finite, self.rectangles, 0.0)
+        seen = (corners - self.position[..., None, None, :]) / self.step[..., None, None, None]
+        low, high = torch.where(finite, seen, self.rectangles).unbind(-2)
         return low, high

@@ -6,7 +6,7 @@ from cnfp_torchrl.modules.actors import (
     make_constrained_actor,
     with_reference_entropy,
 )
-from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, MissingGeometryError
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.flows import ExactFlow, Flow, PaperChain, RadialFlow, UnconstrainedFlow
 from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
@@ -19,6 +19,7 @@ __all__ = [
     "ExactFlow",
     "ExecutedActionGuard",
     "Flow",
+    "MissingGeometryError",
     "PaperChain",
     "RadialFlow",
     "SafeRandomPolicy",

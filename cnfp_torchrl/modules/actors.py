@@ -5,18 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, TensorSpec
 from torchrl.modules import (
     IndependentNormal,
     SafeProbabilisticTensorDictSequential,
     TanhNormal,
 )
 
+from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, ReferenceEntropyFlowModule
+from cnfp_torchrl.modules.flow_module import (
+    ConstrainedFlowModule,
+    ReferenceEntropyFlowModule,
+    action_bounds,
+)
 from cnfp_torchrl.modules.flows import Flow
 
 
@@ -50,7 +56,7 @@ def make_constrained_actor(
 
 
 def constrain(
-    actor: SafeProbabilisticTensorDictSequential,
+    actor: ProbabilisticTensorDictSequential,
     *bijectors: ConstraintBijector,
     flow: Flow | str = "exact",
     order: Sequence[str] | None = None,
@@ -59,7 +65,10 @@ def constrain(
     """Return the actor with constraints appended; its networks are shared, not copied.
 
     The actor's last module must draw from a `TanhNormal` or an `IndependentNormal`: its Gaussian
-    parameters become the base of the flow, so that a tanh is not applied twice.
+    parameters become the base of the flow, so that a tanh is not applied twice. Keys, log-prob and
+    default interaction type stay as they are. An actor that is constrained already keeps its
+    constraints: the new ones are applied after them, with higher priority, unless `order` says
+    otherwise, and `flow` takes the place of its flow.
 
     Args:
         actor: a `torchrl.modules.ProbabilisticActor` or another sequence that ends in a
@@ -71,35 +80,35 @@ def constrain(
 
     Raises:
         TypeError: when the actor does not end in a distribution that can be a base.
-        ValueError: when bounds are missing or the distribution moves its parameters.
+        ValueError: when bounds are missing or are not those of the TanhNormal, when the
+            distribution is more than a Gaussian of location and scale, or when an order does not
+            name each constraint once.
     """
-    *body, head = list(actor.module)
-    if not isinstance(head, ProbabilisticTensorDictModule):
-        raise TypeError(
-            "actor: expected a sequence that ends in a probabilistic module (ProbabilisticActor), "
-            f"given one that ends in {type(head).__name__}"
-        )
-    _refuse_unsuitable_base(head)
-    spec = head.spec if spec is None else spec
-    if spec is None or (hasattr(spec, "keys") and spec[head.out_keys[0]] is None):
+    *body, head = _parts(actor)
+    parameter_keys = _parameter_keys(head)
+    action_key = head.dist_sample_keys[0]
+    spec = getattr(head, "spec", None) if spec is None else spec
+    if spec is None or (isinstance(spec, Composite) and spec[action_key] is None):
         raise ValueError(
             "spec: expected the bounded action spec, but the actor has none; pass "
             "constrain(..., spec=env.action_spec_unbatched)"
         )
+    _refuse_other_bounds(head, action_bounds(spec, action_key))
+    before = head.bijectors if isinstance(head, ConstrainedFlowModule) else []
     constrained = ConstrainedFlowModule(
         spec,
-        bijectors,
+        [*before, *bijectors],
         order=order,
         flow=flow,
-        in_keys=head.in_keys,
-        out_key=head.out_keys[0],
-        return_log_prob=head.return_log_prob,
+        in_keys=parameter_keys,
+        out_key=action_key,
+        **_other_options(head),
     )
     return SafeProbabilisticTensorDictSequential(*body, constrained)
 
 
 def with_reference_entropy(
-    actor: SafeProbabilisticTensorDictSequential,
+    actor: ProbabilisticTensorDictSequential,
 ) -> SafeProbabilisticTensorDictSequential:
     """Return a view of a constrained actor, for a loss, whose samples carry the reference entropy.
 
@@ -108,25 +117,25 @@ def with_reference_entropy(
     Raises:
         TypeError: when the actor does not end in a `ConstrainedFlowModule`.
     """
-    body, head = list(actor.module)[:-1], flow_head(actor)
+    head = flow_head(actor)
     view = ReferenceEntropyFlowModule(
         head.spec,
         head.bijectors,
         flow=head.flow,
         in_keys=head.parameter_keys,
         out_key=head.action_key,
-        return_log_prob=head.return_log_prob,
+        **_other_options(head),
     )
-    return SafeProbabilisticTensorDictSequential(*body, view)
+    return SafeProbabilisticTensorDictSequential(*_parts(actor)[:-1], view)
 
 
-def flow_head(actor: SafeProbabilisticTensorDictSequential) -> ConstrainedFlowModule:
+def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule:
     """Return the flow module that ends a constrained actor.
 
     Raises:
         TypeError: when the actor is not a constrained one.
     """
-    head = list(actor.module)[-1]
+    head = _parts(actor)[-1]
     if not isinstance(head, ConstrainedFlowModule):
         raise TypeError(
             f"actor: expected one that ends in a ConstrainedFlowModule, given {type(head).__name__}"
@@ -135,17 +144,66 @@ def flow_head(actor: SafeProbabilisticTensorDictSequential) -> ConstrainedFlowMo
     return head
 
 
-def _refuse_unsuitable_base(head: ProbabilisticTensorDictModule) -> None:
-    kind: Any = head.distribution_class
-    if kind not in (TanhNormal, IndependentNormal) and not isinstance(head, ConstrainedFlowModule):
+def _parts(actor: ProbabilisticTensorDictSequential) -> list[Any]:
+    """Return the modules of an actor."""
+    if not isinstance(actor, ProbabilisticTensorDictSequential):
+        raise TypeError(
+            "actor: expected a sequence that ends in a probabilistic module, such as a "
+            f"ProbabilisticActor, given {type(actor).__name__}"
+        )
+    modules = actor.module
+    return list(modules.values() if isinstance(modules, nn.ModuleDict) else modules)
+
+
+def _parameter_keys(head: Any) -> list[NestedKey]:
+    """Return the keys of location and scale, or refuse a head that is no base of a flow."""
+    if isinstance(head, ConstrainedFlowModule):
+        return head.parameter_keys
+    kind = getattr(head, "distribution_class", type(head))
+    if kind not in (TanhNormal, IndependentNormal):
         raise TypeError(
             "actor: expected TanhNormal or IndependentNormal as the distribution to constrain, "
             f"given {getattr(kind, '__name__', kind)}; end the actor with one of these"
         )
-    if dict(head.distribution_kwargs).get("tanh_loc", False):
+    options = dict(head.distribution_kwargs)
+    if options.get("tanh_loc", False):
         raise ValueError(
             "actor: expected distribution_kwargs without tanh_loc=True, which moves the Gaussian's "
             "location outside the network; switch it off"
         )
-    if len(head.in_keys) != 2 and not isinstance(head, ConstrainedFlowModule):
-        raise ValueError(f"actor: expected two in_keys, location and scale, given {head.in_keys}")
+    event_dims = options.get("event_dims", options.get("event_dim"))
+    if event_dims not in (None, 1):
+        raise ValueError(
+            f"actor: expected a distribution over vectors, event_dims = 1, given {event_dims}"
+        )
+    names = [key if isinstance(key, str) else key[-1] for key in head.dist_keys]
+    if sorted(names) != ["loc", "scale"]:
+        raise ValueError(
+            "actor: expected a distribution that reads location and scale from the tensordict, "
+            f"in_keys for 'loc' and 'scale', given {names}"
+        )
+    keys = dict(zip(names, head.in_keys, strict=True))
+    return [keys["loc"], keys["scale"]]
+
+
+def _refuse_other_bounds(head: Any, bounds: Box) -> None:
+    if head.distribution_class is not TanhNormal:
+        return
+    for name, usual, expected in (("low", -1.0, bounds.low), ("high", 1.0, bounds.high)):
+        given = torch.as_tensor(head.distribution_kwargs.get(name, usual)).to(expected)
+        if not bool((given == expected).all()):
+            raise ValueError(
+                f"actor: expected a TanhNormal with the action spec's {name} {expected.tolist()}, "
+                f"given {given.tolist()}; build it with distribution_kwargs={{'low': "
+                "spec.space.low, 'high': spec.space.high}"
+            )
+
+
+def _other_options(head: Any) -> dict[str, Any]:
+    """Return what a head does besides its distribution, which another one is to do likewise."""
+    return {
+        "return_log_prob": head.return_log_prob,
+        "log_prob_key": head.log_prob_key,
+        "default_interaction_type": head.default_interaction_type,
+        "num_samples": head.num_samples,
+    }

@@ -7,11 +7,33 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 
 from cnfp_torchrl.bijectors import Bijector, paper_squash
 from cnfp_torchrl.geometry import ConstraintSet
 
 CENTRE_KEY = ("constraints", "centre")
+
+
+class MissingGeometryError(KeyError):
+    """A tensordict lacks an entry that a constraint needs: names the key and what publishes it."""
+
+    def __str__(self) -> str:
+        # KeyError shows the repr of its message, with every quote escaped.
+        return str(self.args[0])
+
+
+def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
+    """Return an entry of a tensordict, or say how to get it there.
+
+    Raises:
+        MissingGeometryError: when it is missing.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        found = sorted(map(str, tensordict.keys(True, True)))
+        raise MissingGeometryError(f"expected {key}, found keys {found}; {remedy}")
+    return value
 
 
 class ConstraintBijector(TensorDictModuleBase):
@@ -63,17 +85,13 @@ class ConstraintBijector(TensorDictModuleBase):
         """Return the sets of allowed actions; their values were checked when published.
 
         Raises:
-            KeyError: when the geometry is missing, naming the key.
+            MissingGeometryError: when the geometry is missing, naming the key.
         """
-        values = {}
-        for key, field in zip(self.geometry_keys, self.set_type.event_dims, strict=True):
-            values[field] = tensordict.get(key, None)
-            if values[field] is None:
-                raise KeyError(
-                    f"constraint '{self.name}': expected its geometry at {key}, found keys "
-                    f"{sorted(map(str, tensordict.keys(True, True)))}; append the environment "
-                    "transform that publishes it"
-                )
+        remedy = f"append the environment transform that publishes constraint '{self.name}'"
+        values = {
+            field: require(tensordict, key, remedy)
+            for key, field in zip(self.geometry_keys, self.set_type.event_dims, strict=True)
+        }
         return self.set_type(**values, validate_args=False)
 
     def get_transform(self, tensordict: TensorDictBase) -> Bijector:

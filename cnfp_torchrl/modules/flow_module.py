@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import InteractionType
+from tensordict.nn import InteractionType, set_interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
@@ -17,8 +17,15 @@ from torchrl.modules import SafeProbabilisticModule
 from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Box, Region
-from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
+from cnfp_torchrl.modules.constraint_bijector import (
+    CENTRE_KEY,
+    ConstraintBijector,
+    in_order,
+    require,
+)
 from cnfp_torchrl.modules.flows import Flow, resolve_flow
+
+_CENTRE_REMEDY = "append cnfp_torchrl.envs.ConstraintCentre after the geometry transforms"
 
 
 class ConstrainedFlowModule(SafeProbabilisticModule):
@@ -38,6 +45,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
         out_key: the action, ``(*batch, d)``.
         return_log_prob: also write the action's log-density, ``(*batch,)``.
+        default_interaction_type: how to act where no exploration type is set.
+        kwargs: passed on to `torchrl.modules.SafeProbabilisticModule`, such as ``log_prob_key``.
 
     Raises:
         ValueError: when the spec is unbounded or an order does not name each constraint once.
@@ -57,14 +66,17 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         in_keys: Sequence[NestedKey] = ("loc", "scale"),
         out_key: NestedKey = "action",
         return_log_prob: bool = False,
+        default_interaction_type: InteractionType = InteractionType.RANDOM,
+        **kwargs: Any,
     ) -> None:
         super().__init__(
             in_keys=list(in_keys),
             out_keys=[out_key],
             spec=spec,
             distribution_class=self.distribution_type,
-            default_interaction_type=InteractionType.RANDOM,
+            default_interaction_type=default_interaction_type,
             return_log_prob=return_log_prob,
+            **kwargs,
         )
         bounds = action_bounds(spec, out_key)
         self.register_buffer("low", bounds.low, persistent=False)
@@ -114,7 +126,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            KeyError: when geometry, centre or active flags are missing, naming the key.
+            MissingGeometryError: when geometry, centre or active flags are missing.
         """
         bounds = self.bounds
         if not self.flow.reads_constraints:
@@ -138,13 +150,26 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     build_dist_from_params = get_dist
 
+    def random(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act on standard Gaussian noise, whatever the network says; writes that Gaussian too.
+
+        The safe counterpart of TorchRL's method, which draws uniformly from the action spec.
+        """
+        zeros = self.low.new_zeros(*tensordict.shape, *self.low.shape)
+        for key, value in zip(self.parameter_keys, (zeros, torch.ones_like(zeros)), strict=True):
+            tensordict.set(key, value)
+        with set_interaction_type(InteractionType.RANDOM):
+            return self(tensordict)
+
     def _centre(self, tensordict: TensorDictBase) -> Tensor:
-        return _require(tensordict, CENTRE_KEY)
+        return require(tensordict, CENTRE_KEY, _CENTRE_REMEDY)
 
     def _active(self, tensordict: TensorDictBase) -> Tensor | None:
         if not self.bijectors:
             return None
-        flags = [_require(tensordict, bijector.active_key) for bijector in self.bijectors]
+        flags = [
+            require(tensordict, bijector.active_key, _CENTRE_REMEDY) for bijector in self.bijectors
+        ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
 
 
@@ -165,27 +190,29 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = "action") -> Box:
         ValueError: when the spec has no finite bounds or they differ along batch dimensions.
     """
     leaf = spec[action_key] if isinstance(spec, Composite) else spec
+    bounds = _finite_bounds(leaf)
+    given = f"given {type(leaf).__name__} of shape {tuple(getattr(leaf, 'shape', ()))}"
+    if bounds is None:
+        raise ValueError(
+            f"spec of '{action_key}': expected a continuous spec of vectors with bounds on both "
+            f"sides, the first stage of every flow, {given}"
+        )
+    low, high = (bound.reshape(-1, bound.shape[-1]) for bound in bounds)
+    if bool((low != low[0]).any() | (high != high[0]).any()):
+        raise ValueError(
+            f"spec of '{action_key}': expected the same bounds for all batch elements, {given}; "
+            "pass env.action_spec_unbatched"
+        )
+    return Box(low[0].clone(), high[0].clone())
+
+
+def _finite_bounds(leaf: Any) -> tuple[Tensor, Tensor] | None:
     space = getattr(leaf, "space", None)
     low, high = getattr(space, "low", None), getattr(space, "high", None)
-    if low is None or high is None or not bool((low.isfinite() & high.isfinite()).all()):
-        raise ValueError(
-            f"spec of '{action_key}': expected a bounded action spec, given {leaf}; the action "
-            "bounds are the first stage of every flow"
-        )
-    rows = [bound.reshape(-1, bound.shape[-1]) for bound in (low, high)]
-    if any(bool((row != row[0]).any()) for row in rows):
-        raise ValueError(
-            f"spec of '{action_key}': expected the same bounds for all batch elements, given "
-            f"{leaf}; pass env.action_spec_unbatched"
-        )
-    return Box(rows[0][0].clone(), rows[1][0].clone())
-
-
-def _require(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    value = tensordict.get(key, None)
-    if value is None:
-        raise KeyError(
-            f"expected {key}, found keys {sorted(map(str, tensordict.keys(True, True)))}; append "
-            "cnfp_torchrl.envs.ConstraintCentre after the geometry transforms"
-        )
-    return value
+    if not isinstance(low, Tensor) or not isinstance(high, Tensor):
+        return None
+    if low.ndim == 0 or not low.is_floating_point():
+        return None
+    # TorchRL gives unbounded specs the largest numbers of their dtype for bounds.
+    limits = torch.finfo(low.dtype)
+    return (low, high) if bool(((low > limits.min) & (high < limits.max)).all()) else None

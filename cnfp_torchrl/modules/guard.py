@@ -37,7 +37,7 @@ class ExecutedActionGuard(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the tensordict unchanged, or raise."""
-        action = tensordict.get(self.head.action_key)
+        action = tensordict.get(self.head.action_key).detach()
         region = self.head.get_region(tensordict)
         if bool(region.contains(action).all()):
             return tensordict
@@ -47,7 +47,9 @@ class ExecutedActionGuard(TensorDictModuleBase):
                 bad = bad & region.active[..., stage]
             if bool(bad.any()):
                 index = tuple(int(i) for i in bad.nonzero()[0])
-                slack = float(each.slack(action)[index])
+                # In float64, as `contains`: in float32 the slack may round to 0.
+                exact = each.with_fields(lambda field, _: field.double())
+                slack = float(exact.slack(action.double())[index])
                 raise ConstraintViolationError(
                     f"constraint '{name}': expected an action inside its set, given "
                     f"{action[index].tolist()} with slack {slack:.3g} at batch index {list(index)}"

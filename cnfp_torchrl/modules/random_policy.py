@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
@@ -14,7 +13,8 @@ from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 class SafeRandomPolicy(TensorDictModuleBase):
     """Push standard Gaussian noise through the flow: the safe counterpart of ``env.rand_action``.
 
-    TorchRL's own random actions are uniform over the action spec and break constraints.
+    TorchRL's own random actions are uniform over the action spec and break constraints. Writes what
+    the flow module writes, and location 0 and scale 1 where a network would write its own.
 
     Args:
         head: the flow module of a constrained actor.
@@ -24,13 +24,11 @@ class SafeRandomPolicy(TensorDictModuleBase):
         super().__init__()
         self.head = head
         self.in_keys = head.geometry_keys()
-        self.out_keys = [head.action_key]
+        self.out_keys = [*head.parameter_keys, *head.out_keys]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action for every batch element."""
-        low = self.head.low
-        latent = torch.randn(*tensordict.shape, *low.shape, dtype=low.dtype, device=low.device)
-        return tensordict.set(self.head.action_key, self.head.get_bijector(tensordict)(latent))
+        return self.head.random(tensordict)
 
 
 class WarmUpPolicy(TensorDictModuleBase):
@@ -56,7 +54,8 @@ class WarmUpPolicy(TensorDictModuleBase):
         """Write the action of the policy whose turn it is."""
         if self.frames_left > 0:
             self.frames_left -= max(tensordict.numel(), 1)
-            # The actor runs too, so that every step carries the same keys.
+            # The actor runs too, for keys of its own besides the Gaussian's parameters: every step
+            # must carry the same ones.
             self.actor(tensordict)
             return self.random(tensordict)
         return self.actor(tensordict)

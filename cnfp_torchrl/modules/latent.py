@@ -1,0 +1,168 @@
+r"""Constrained actors cut at the latent: what PPO, and deterministic policies such as TD3's, need.
+
+The flow :math:`a = f(z)` has no parameters, so a stored latent says all that a stored action says,
+and says it exactly. PPO's ratio is that of the latents' densities, because the log-determinants
+cancel, :math:`\pi_{new}(a|s) / \pi_{old}(a|s) = p_{new}(z|s) / p_{old}(z|s)`, whereas inverting a
+saturated float32 action loses it. Exploration noise added to the latent is carried to an allowed
+action; added to the action it breaks the constraints.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.modules import (
+    IndependentNormal,
+    SafeProbabilisticModule,
+    SafeProbabilisticTensorDictSequential,
+)
+
+from cnfp_torchrl.distributions import ConstrainedFlow
+from cnfp_torchrl.modules.actors import _parts, flow_head
+from cnfp_torchrl.modules.constraint_bijector import require
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+
+LATENT_KEY = "latent"
+LATENT_LOG_PROB_KEY = "latent_log_prob"
+
+
+class FlowMap(TensorDictModuleBase):
+    """Map a latent to an allowed action: the flow of a `ConstrainedFlowModule`, no sampling.
+
+    It has no parameters. A deterministic policy is a network that writes the latent, exploration
+    noise on the latent, and this map; a critic that reads latents is this map and a critic of
+    actions (``experiments/examples/td3_latent_noise.py``).
+
+    Args:
+        head: the flow module: of a constrained actor (`flow_head`), or one made for this purpose,
+            ``ConstrainedFlowModule(spec, bijectors)``.
+        latent_key: where the latent ``(*batch, d)`` stands.
+
+    Raises:
+        ValueError: when called on latents of another dimension than the action.
+        MissingGeometryError: when called without a latent, or without the geometry.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule, latent_key: NestedKey = LATENT_KEY) -> None:
+        super().__init__()
+        self.head = head
+        self.latent_key = latent_key
+        self.in_keys = [latent_key, *head.geometry_keys()]
+        self.out_keys = [head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action ``(*batch, d)``."""
+        latent = require(tensordict, self.latent_key, "put a module that writes it before the map")
+        if latent.shape[-1:] != self.head.low.shape:
+            raise ValueError(
+                f"key {self.latent_key!r}: expected latents of {self.head.low.shape[-1]} "
+                f"components, as the action has, given shape {tuple(latent.shape)}"
+            )
+        return tensordict.set(self.head.action_key, self.head.get_bijector(tensordict)(latent))
+
+
+class LatentGaussian(IndependentNormal):
+    """The Gaussian under a flow, a distribution over latents that knows its action's entropy.
+
+    Args:
+        flow: the distribution over actions; its base must be a Gaussian.
+    """
+
+    def __init__(self, flow: ConstrainedFlow) -> None:
+        gaussian = flow.base_dist.base_dist
+        super().__init__(gaussian.loc, gaussian.scale, validate_args=False)
+        self.flow = flow
+
+    def entropy(self) -> Tensor:
+        """Return a one-sample estimate of the action's entropy, ``(*batch,)``, with its gradient.
+
+        Not the latent's, which would be rewarded for growing without end while all actions crowd at
+        the boundary.
+        """
+        return -self.flow.rsample_and_log_prob()[1]
+
+
+class LatentScorer(SafeProbabilisticModule):
+    """The Gaussian under a flow as the last module of an actor, for losses.
+
+    Args:
+        head: the flow module.
+        kwargs: passed on to `torchrl.modules.SafeProbabilisticModule`.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule, **kwargs: Any) -> None:
+        super().__init__(distribution_class=LatentGaussian, **kwargs)
+        self.head = head
+        self.in_keys = list(head.in_keys)
+
+    def get_dist(self, tensordict: TensorDictBase) -> LatentGaussian:
+        """Return the distribution over latents in the states of a tensordict."""
+        return LatentGaussian(self.head.get_dist(tensordict))
+
+    build_dist_from_params = get_dist
+
+
+class LatentActor(NamedTuple):
+    """A constrained actor cut at its latent; the networks are the actor's own.
+
+    Args:
+        policy: draws and writes latent and log-density, then maps the latent to the action: for
+            collectors and environments.
+        base: ends at the latent, scores stored ones: the ``actor_network`` of a loss.
+    """
+
+    policy: TensorDictSequential
+    base: SafeProbabilisticTensorDictSequential
+
+
+def split_at_latent(
+    actor: ProbabilisticTensorDictSequential,
+    *,
+    latent_key: NestedKey = LATENT_KEY,
+    log_prob_key: NestedKey = LATENT_LOG_PROB_KEY,
+) -> LatentActor:
+    """Return a constrained actor as a policy that stores its latents, and a view that scores them.
+
+    For losses that score stored samples, such as `torchrl.objectives.ClipPPOLoss`::
+
+        policy, base = split_at_latent(actor)
+        collector = Collector(env, policy, ...)
+        loss = ClipPPOLoss(base, critic)
+
+    The ratios are exact however saturated the actions are, and so are divergences between two
+    policies, which the flow leaves as they are. The entropy bonus is a Monte-Carlo estimate of the
+    action's entropy, one sample a state whatever ``samples_mc_entropy``; for the reference entropy
+    pass ``with_reference_entropy(actor)``; for none, ``entropy_coeff=0`` or ``entropy_bonus=False``.
+
+    Args:
+        actor: a constrained actor; parameters are shared, not copied.
+        latent_key: where the latents ``(*batch, d)`` are stored.
+        log_prob_key: where their log-densities ``(*batch,)`` are stored.
+
+    Raises:
+        TypeError: when the actor does not end in a `ConstrainedFlowModule`.
+    """
+    head = flow_head(actor)
+    body = _parts(actor)[:-1]
+    options: dict[str, Any] = {
+        "in_keys": list(head.parameter_keys),
+        "out_keys": [latent_key],
+        "return_log_prob": True,
+        "log_prob_key": log_prob_key,
+        "default_interaction_type": head.default_interaction_type,
+        "num_samples": head.num_samples,
+    }
+    # Not the scorer, which would build each state's flow once more than acting needs.
+    sampler = SafeProbabilisticModule(distribution_class=IndependentNormal, **options)
+    return LatentActor(
+        policy=TensorDictSequential(*body, sampler, FlowMap(head, latent_key)),
+        base=SafeProbabilisticTensorDictSequential(*body, LatentScorer(head, **options)),
+    )

@@ -1,0 +1,231 @@
+"""The mathematics of sets and flows written a second time, sharing no code with the package.
+
+Membership in NumPy, on the exact numbers that a policy returned; flows in mpmath, to as many digits
+as they need. No gauges here: where a ray leaves a set is found by bisection on membership.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpmath import mp, mpf
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    Ellipsoid,
+    HalfSpaces,
+    PositivePart,
+    VisibleRegion,
+    WeightedL1Ball,
+)
+
+# Enough that 1 - tanh(z) is not rounded to 0 where it matters: the flows below add it to numbers of
+# size one, and the tests compare to 1e-9.
+mp.dps = 34
+
+Vector = list[mpf]
+
+
+def contains(
+    each: ConstraintSet, action: Tensor, number: type[np.floating] = np.float64
+) -> NDArray[np.bool_]:
+    """Tell, in NumPy, whether actions lie in a set, on the exact values of all tensors.
+
+    Args:
+        each: the set.
+        action: ``(*sample, *batch, d)``.
+        number: the type to compute in, longer than the tensors' own: its rounding errors must be
+            far below the distance of two neighbouring actions.
+    """
+    a = action.detach().numpy().astype(number)
+    fields = {name: value.numpy().astype(number) for name, value in each.fields().items()}
+    match each:
+        case Box():
+            return ((fields["low"] <= a) & (a <= fields["high"])).all(-1)
+        case Ball():
+            return ((a - fields["center"]) ** 2).sum(-1) <= fields["radius"] ** 2
+        case Ellipsoid():
+            return (_forward_substitution(fields["scale_tril"], a - fields["center"]) ** 2).sum(
+                -1
+            ) <= 1
+        case HalfSpaces():
+            return ((fields["normals"] * a[..., None, :]).sum(-1) <= fields["offsets"]).all(-1)
+        case WeightedL1Ball():
+            return np.abs(fields["weights"] * a).sum(-1) <= fields["bound"]
+        case PositivePart():
+            return np.maximum(fields["weights"] * a, 0).sum(-1) <= fields["bound"]
+        case VisibleRegion():
+            return _sees(fields, a)
+    raise NotImplementedError(type(each).__name__)
+
+
+def _forward_substitution(
+    tril: NDArray[np.floating], right: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    solution = np.zeros(np.broadcast_shapes(right.shape, tril.shape[:-1]), dtype=right.dtype)
+    for i in range(tril.shape[-1]):
+        known = (tril[..., i, :i] * solution[..., :i]).sum(-1)
+        solution[..., i] = (right[..., i] - known) / tril[..., i, i]
+    return solution
+
+
+def _sees(fields: dict[str, NDArray[np.floating]], a: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Tell whether segments miss closed rectangles: one of some directions separates the two.
+
+    For a segment and a rectangle in the plane the axes and the segment's normal suffice.
+    """
+    start = fields["position"][..., None, :]
+    end = start + fields["step"][..., None, None] * a[..., None, :]
+    # A thousand is as good as infinite in an arena of size one, and does not make NaN.
+    corner = np.clip(fields["rectangles"], -1000, 1000)
+    low, high = corner[..., 0, :], corner[..., 1, :]
+    beside = (np.maximum(start, end) < low) | (np.minimum(start, end) > high)
+    assert a.shape[-1] == 2, "in more dimensions there are more separating directions"
+    normal = np.stack([start[..., 1] - end[..., 1], end[..., 0] - start[..., 0]], -1)
+    corners = np.stack(
+        [
+            (normal * (np.stack([x, y], -1) - start)).sum(-1)
+            for x in (low[..., 0], high[..., 0])
+            for y in (low[..., 1], high[..., 1])
+        ]
+    )
+    across = (corners > 0).all(0) | (corners < 0).all(0)
+    return (beside.any(-1) | across).all(-1)
+
+
+def level(each: ConstraintSet, action: Vector) -> mpf:
+    """Return, in mpmath, a number that is at most 1 exactly on the set, which has no batch."""
+    fields = {name: to_mp(value) for name, value in each.fields().items()}
+    match each:
+        case Box():
+            pairs = zip(fields["low"], fields["high"], action, strict=True)
+            return 1 + max(max(low - a, a - high) for low, high, a in pairs)
+        case Ball():
+            return distance(action, fields["center"]) / fields["radius"]
+        case Ellipsoid():
+            return mp.sqrt(
+                sum(x**2 for x in whitened(fields["scale_tril"], action, fields["center"]))
+            )
+        case HalfSpaces():
+            rows = zip(fields["normals"], fields["offsets"], strict=True)
+            return 1 + max(dot(normal, action) - offset for normal, offset in rows)
+        case WeightedL1Ball():
+            terms = zip(fields["weights"], action, strict=True)
+            return sum((abs(w * a) for w, a in terms), mpf(0)) / fields["bound"]
+        case PositivePart():
+            terms = zip(fields["weights"], action, strict=True)
+            return sum((max(w * a, mpf(0)) for w, a in terms), mpf(0)) / fields["bound"]
+    raise NotImplementedError(type(each).__name__)
+
+
+def box_squash(box: Box, latent: Vector) -> tuple[Vector, mpf]:
+    low, high = to_mp(box.low), to_mp(box.high)
+    action, log_det = [], mpf(0)
+    for lower, upper, z in zip(low, high, latent, strict=True):
+        action.append(lower + (upper - lower) / (1 + mp.exp(-2 * z)))
+        log_det += mp.log((upper - lower) / 2) - 2 * mp.log(mp.cosh(z))
+    return action, log_det
+
+
+def unit_ball_squash(latent: Vector) -> tuple[Vector, mpf]:
+    rho = mp.sqrt(sum(z**2 for z in latent))
+    if rho == 0:
+        return latent, mpf(0)
+    share = mp.tanh(rho) / rho
+    return [z * share for z in latent], -2 * mp.log(mp.cosh(rho)) + (len(latent) - 1) * mp.log(
+        share
+    )
+
+
+def ball_squash(ball: Ball, latent: Vector) -> tuple[Vector, mpf]:
+    center, radius = to_mp(ball.center), to_mp(ball.radius)
+    point, log_det = unit_ball_squash(latent)
+    return along(center, point, radius), log_det + len(latent) * mp.log(radius)
+
+
+def ellipsoid_squash(ellipsoid: Ellipsoid, latent: Vector) -> tuple[Vector, mpf]:
+    center, tril = to_mp(ellipsoid.center), to_mp(ellipsoid.scale_tril)
+    point, log_det = unit_ball_squash(latent)
+    action = [m + dot(row, point) for m, row in zip(center, tril, strict=True)]
+    return action, log_det + sum(mp.log(tril[i][i]) for i in range(len(latent)))
+
+
+def gauge_squash(
+    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+) -> tuple[Vector, mpf]:
+    box, c = sets[0], to_mp(centre)
+    assert isinstance(box, Box)
+    bounded, log_det = box_squash(box, latent)
+    offset = [x - y for x, y in zip(bounded, c, strict=True)]
+    whole = exit_along(c, offset, sets[:1])
+    share = exit_along(c, offset, sets) / whole
+    return along(c, offset, share), log_det + len(latent) * mp.log(share)
+
+
+def radial_squash(
+    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+) -> tuple[Vector, mpf]:
+    c, rho = to_mp(centre), mp.sqrt(sum(z**2 for z in latent))
+    point, log_det = unit_ball_squash(latent)
+    width = exit_along(c, [z / rho for z in latent], sets)
+    return along(c, point, width), log_det + len(latent) * mp.log(width)
+
+
+def exit_along(centre: Vector, offset: Vector, sets: Sequence[ConstraintSet]) -> mpf:
+    """Return the largest t with ``centre + t offset`` in all sets, the first of them a box."""
+    box = sets[0]
+    assert isinstance(box, Box)
+    faces = zip(to_mp(box.low), to_mp(box.high), centre, offset, strict=True)
+    outside = min(((high if v > 0 else low) - c) / v for low, high, c, v in faces if v != 0)
+    for each in sets[1:]:
+        inside, beyond = mpf(0), outside
+        if level(each, along(centre, offset, beyond)) <= 1:
+            continue
+        while beyond - inside > beyond * mpf(10) ** -20:
+            middle = (inside + beyond) / 2
+            if level(each, along(centre, offset, middle)) <= 1:
+                inside = middle
+            else:
+                beyond = middle
+        outside = inside
+    return outside
+
+
+def normal_log_prob(latent: Vector, loc: Vector, scale: Vector) -> mpf:
+    total = mpf(0)
+    for z, m, sigma in zip(latent, loc, scale, strict=True):
+        total -= ((z - m) / sigma) ** 2 / 2 + mp.log(sigma) + mp.log(2 * mp.pi) / 2
+    return total
+
+
+def to_mp(value: Tensor) -> mpf | Vector | list[Vector]:
+    """Return the exact values of a tensor, as nested lists."""
+
+    def convert(item: float | list) -> mpf | list:
+        return [convert(each) for each in item] if isinstance(item, list) else mpf(item)
+
+    return convert(value.double().tolist())
+
+
+def along(centre: Vector, offset: Vector, share: mpf) -> Vector:
+    return [c + share * v for c, v in zip(centre, offset, strict=True)]
+
+
+def dot(left: Vector, right: Vector) -> mpf:
+    return mp.fsum(x * y for x, y in zip(left, right, strict=True))
+
+
+def distance(left: Vector, right: Vector) -> mpf:
+    return mp.sqrt(mp.fsum((x - y) ** 2 for x, y in zip(left, right, strict=True)))
+
+
+def whitened(tril: list[Vector], action: Vector, center: Vector) -> Vector:
+    solution: Vector = []
+    for i, row in enumerate(tril):
+        solution.append((action[i] - center[i] - dot(row[:i], solution)) / row[i])
+    return solution

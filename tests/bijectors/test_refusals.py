@@ -1,0 +1,125 @@
+"""What is refused, and that the message names the field, what was expected and what was given."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from cnfp_torchrl.bijectors import (
+    BallSquash,
+    BijectorChain,
+    BoxSquash,
+    EllipsoidSquash,
+    GaugeSquash,
+    Retraction,
+    paper_squash,
+)
+from cnfp_torchrl.geometry import Ball, Box, GeometryError, HalfSpaces, Region
+
+ONE, ZERO = torch.ones(2), torch.zeros(2)
+HALF = torch.ones(2, dtype=torch.bfloat16)
+BOX = Box(-ONE, ONE)
+
+
+def unchecked_region(low: torch.Tensor, high: torch.Tensor) -> Region:
+    return Region((Box(low, high, validate_args=False),), ZERO)
+
+
+REFUSED = {
+    "low above high": (
+        lambda: BoxSquash(torch.tensor([0.0, 2.0]), torch.tensor([1.0, 1.0])),
+        "field 'low' at index [1]: expected low < high, given 2.0",
+    ),
+    "low equal to high": (lambda: BoxSquash(ONE, ONE), "expected low < high, given 1.0"),
+    "NaN bound": (lambda: BoxSquash(ZERO, ONE * torch.nan), "field 'high' at index [0]"),
+    "unbounded": (lambda: BoxSquash(ZERO, ONE * torch.inf), "expected finite bounds, given low"),
+    "thin box": (
+        lambda: BoxSquash(1000 * ONE, torch.tensor([1001.0, 1000.001])),
+        "bounds further apart than rounding error in torch.float32",
+    ),
+    "half precision box": (
+        lambda: BoxSquash(-HALF, HALF),
+        "field 'low': expected a float32 or float64 tensor, given torch.bfloat16",
+    ),
+    "mixed precision": (
+        lambda: BoxSquash(-ONE, ONE.double()),
+        "expected one dtype for all fields, given",
+    ),
+    "scalar bounds": (
+        lambda: BoxSquash(torch.tensor(-1.0), torch.tensor(1.0)),
+        "field 'low': expected at least 1 dimensions (*batch, ...), given shape ()",
+    ),
+    "negative radius": (
+        lambda: BallSquash(ZERO, torch.tensor(-0.5)),
+        "field 'radius': expected a finite radius > 0, given -0.5",
+    ),
+    "zero radius in a batch": (
+        lambda: BallSquash(torch.zeros(3, 2), torch.tensor([1.0, 0.0, 1.0])),
+        "field 'radius' at index [1]: expected a finite radius > 0, given 0.0",
+    ),
+    "ball below resolution": (
+        lambda: BallSquash(1000 * ONE, torch.tensor(1e-3)),
+        "expected a radius above rounding error in torch.float32, given radius",
+    ),
+    "half precision ball": (
+        lambda: BallSquash(HALF, HALF[0]),
+        "given torch.bfloat16; convert it (half precision",
+    ),
+    "batches that do not broadcast": (
+        lambda: BallSquash(torch.zeros(3, 2), torch.ones(4)),
+        "expected batch shapes that broadcast, given {'center': (3, 2), 'radius': (4,)}",
+    ),
+    "upper triangle": (
+        lambda: EllipsoidSquash(ZERO, torch.ones(2, 2)),
+        "field 'scale_tril' at index [0, 1]: expected zeros above the diagonal, given 1.0",
+    ),
+    "negative diagonal": (
+        lambda: EllipsoidSquash(ZERO, -torch.eye(2)),
+        "field 'scale_tril' at index [0, 0]: expected a positive diagonal, given -1.0",
+    ),
+    "ellipsoid below resolution": (
+        lambda: EllipsoidSquash(1000 * ONE, 1e-3 * torch.eye(2)),
+        "expected an ellipsoid wider than rounding error in torch.float32",
+    ),
+    "bounds that are no box": (
+        lambda: GaugeSquash(Region((Ball(ZERO, torch.tensor(1.0)), BOX), ZERO)),
+        "sets[0]: expected the Box of action bounds, given sets ['Ball', 'Box']",
+    ),
+    "dimensions that differ": (
+        lambda: GaugeSquash(Region((BOX, Ball(torch.zeros(3), torch.tensor(1.0))), ZERO)),
+        "expected one action dimension, given [2, 3] and 2",
+    ),
+    "bounds that were never checked": (
+        lambda: GaugeSquash(unchecked_region(ONE, -ONE)),
+        "expected low < high, given 1.0",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_input_is_refused(name: str) -> None:
+    build, message = REFUSED[name]
+    with pytest.raises(GeometryError, match=re.escape(message)):
+        build()
+
+
+def test_empty_chain_is_refused() -> None:
+    with pytest.raises(ValueError, match="bijectors: expected at least one, given an empty chain"):
+        BijectorChain([])
+
+
+def test_family_without_a_squash_is_refused() -> None:
+    half_space = HalfSpaces(torch.ones(1, 2), torch.ones(1))
+    with pytest.raises(TypeError, match=r"one of \['Box', 'Ball', 'Ellipsoid'\], given HalfSpaces"):
+        paper_squash(half_space)
+
+
+def test_checks_can_be_left_out() -> None:
+    """Where values were checked before: in the compiled path nothing reads them on the host."""
+    BoxSquash(ONE, -ONE, validate_args=False)
+    BallSquash(ZERO, torch.tensor(-1.0), validate_args=False)
+    EllipsoidSquash(ZERO, -torch.eye(2), validate_args=False)
+    GaugeSquash(unchecked_region(ONE, -ONE), validate_args=False)
+    Retraction(BOX, Ball(ZERO, torch.tensor(0.5)), ZERO)

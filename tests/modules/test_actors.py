@@ -1,0 +1,353 @@
+"""Constraining an actor that exists: what changes, what stays, and what is refused."""
+
+import re
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import (
+    ActorValueOperator,
+    Delta,
+    IndependentNormal,
+    ProbabilisticActor,
+    TanhDelta,
+    TanhNormal,
+    TruncatedNormal,
+    ValueOperator,
+)
+
+from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.geometry import Ball
+from cnfp_torchrl.modules import (
+    ConstrainedFlowModule,
+    ConstraintBijector,
+    constrain,
+    flow_head,
+    guarded,
+    with_reference_entropy,
+)
+
+MakeActor = Callable[..., Any]
+Inside = Callable[[TensorDictBase], dict[str, Tensor]]
+
+# Of the box squash, whose bounds are moved inwards by 16 rounding errors (`Box.eroded`).
+EROSION = 16 * torch.finfo(torch.float32).eps
+
+
+@pytest.fixture
+def bijectors(env: TransformedEnv) -> list[ConstraintBijector]:
+    return constraint_bijectors(env)
+
+
+@pytest.fixture
+def unbound(state: TensorDictBase) -> TensorDictBase:
+    """States in which no constraint binds: the sets are as wide as the action bounds allow."""
+    state["constraints", "battery", "radius"] = torch.full((8,), 1e3)
+    state["constraints", "obstacle", "low"] = torch.full((8, 2), -2.0)
+    state["constraints", "obstacle", "high"] = torch.full((8, 2), 2.0)
+    return state
+
+
+def act(actor: nn.Module, state: TensorDictBase) -> TensorDictBase:
+    torch.manual_seed(1)
+    with set_exploration_type(ExplorationType.RANDOM):
+        return actor(state.clone())
+
+
+# What changes and what stays ----------------------------------------------------------------------
+
+
+def test_without_binding_constraints_a_tanh_actor_is_unchanged(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], unbound: TensorDictBase
+) -> None:
+    # A second tanh would move the action by up to 1 - tanh(1) = 0.24.
+    actor = make_tanh_actor(return_log_prob=True)
+    many = unbound.expand(100, 8).clone()
+    expected, got = act(actor, many), act(constrain(actor, *bijectors), many)
+    assert expected["action"].abs().max() > 0.9
+    torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
+    torch.testing.assert_close(
+        got["action_log_prob"], expected["action_log_prob"], rtol=1e-3, atol=1e-3
+    )
+
+
+def test_an_independent_normal_becomes_the_base(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], unbound: TensorDictBase
+) -> None:
+    actor = make_tanh_actor(distribution_class=IndependentNormal)
+    latent, got = act(actor, unbound)["action"], act(constrain(actor, *bijectors), unbound)
+    torch.testing.assert_close(got["action"], latent.tanh(), rtol=0, atol=2 * EROSION)
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial"])
+@pytest.mark.parametrize("distribution", [TanhNormal, IndependentNormal])
+def test_constraints_hold_that_did_not(
+    make_tanh_actor: MakeActor,
+    bijectors: list[ConstraintBijector],
+    state: TensorDictBase,
+    inside: Inside,
+    distribution: type,
+    flow: str,
+) -> None:
+    actor = make_tanh_actor(distribution_class=distribution)
+    many = state.expand(500, 8).clone()
+    before = inside(act(actor, many))
+    after = inside(act(constrain(actor, *bijectors, flow=flow), many))
+    for name in ("battery", "obstacle"):
+        assert not before[name].all()
+        assert after[name].all()
+
+
+def test_networks_are_shared(
+    make_tanh_actor: MakeActor,
+    bijectors: list[ConstraintBijector],
+    network: nn.Module,
+    state: TensorDictBase,
+) -> None:
+    actor = make_tanh_actor()
+    constrained = constrain(actor, *bijectors)
+    assert [id(each) for each in constrained.parameters()] == [id(p) for p in network.parameters()]
+    before = actor(state.clone())["loc"]
+    constrained(state.clone())["action"].sum().backward()
+    for parameter in constrained.parameters():
+        parameter.data -= parameter.grad
+    assert not torch.equal(actor(state.clone())["loc"], before)
+
+
+def test_a_checkpoint_of_the_actor_fits_the_constrained_one(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    actor = make_tanh_actor()
+    assert constrain(actor, *bijectors).state_dict().keys() == actor.state_dict().keys()
+
+
+def test_the_actor_itself_is_left_alone(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
+) -> None:
+    actor = make_tanh_actor()
+    before = act(actor, state)["action"]
+    constrain(actor, *bijectors)
+    assert type(actor.get_dist(state.clone())) is TanhNormal
+    assert torch.equal(act(actor, state)["action"], before)
+
+
+@pytest.mark.parametrize(
+    ("in_keys", "out_key", "log_prob_key"),
+    [
+        (["loc", "scale"], "action", "action_log_prob"),
+        ([("agent", "loc"), ("agent", "scale")], ("agent", "move"), ("agent", "move_log_prob")),
+        (["scale", "loc"], "action", "score"),
+        ({"loc": "mean", "scale": "deviation"}, "move", "move_log_prob"),
+        ({"scale": ("p", "deviation"), "loc": ("p", "mean")}, "action", "action_log_prob"),
+    ],
+    ids=["usual", "nested", "swapped", "renamed", "renamed and swapped"],
+)
+def test_keys_stay(
+    network: nn.Module,
+    bijectors: list[ConstraintBijector],
+    unbound: TensorDictBase,
+    in_keys: Any,
+    out_key: Any,
+    log_prob_key: Any,
+) -> None:
+    names = in_keys if isinstance(in_keys, dict) else dict(zip(("a", "b"), in_keys, strict=True))
+    if not isinstance(in_keys, dict):
+        names = {key if isinstance(key, str) else key[-1]: key for key in in_keys}
+    body = TensorDictModule(network, in_keys=["obs"], out_keys=[names["loc"], names["scale"]])
+    actor = ProbabilisticActor(
+        body,
+        in_keys=in_keys,
+        out_keys=[out_key],
+        spec=Bounded(-1, 1, (2,)),
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+        log_prob_key=log_prob_key,
+    )
+    constrained = constrain(actor, *bijectors)
+    assert constrained.in_keys[0] == "obs"
+    assert set(constrained.out_keys) == set(actor.out_keys)
+    state = unbound.set("obs", unbound["observation"])
+    expected, got = act(actor, state), act(constrained, state)
+    torch.testing.assert_close(got[out_key], expected[out_key], rtol=0, atol=2 * EROSION)
+    torch.testing.assert_close(got[log_prob_key], expected[log_prob_key], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [InteractionType.RANDOM, InteractionType.DETERMINISTIC], ids=str)
+def test_the_default_interaction_type_stays(
+    make_tanh_actor: MakeActor,
+    bijectors: list[ConstraintBijector],
+    state: TensorDictBase,
+    kind: InteractionType,
+) -> None:
+    actor = constrain(make_tanh_actor(default_interaction_type=kind), *bijectors)
+    repeats = torch.equal(actor(state.clone())["action"], actor(state.clone())["action"])
+    assert repeats == (kind is InteractionType.DETERMINISTIC)
+
+
+def test_several_samples_at_once(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
+) -> None:
+    actor = make_tanh_actor(num_samples=3, default_interaction_type=InteractionType.RANDOM)
+    assert constrain(actor, *bijectors)(state)["action"].shape == (3, 8, 2)
+
+
+@pytest.mark.parametrize(
+    ("order", "expected"),
+    [(None, ["obstacle", "battery"]), (["battery", "obstacle"], ["battery", "obstacle"])],
+)
+def test_order(
+    make_tanh_actor: MakeActor,
+    bijectors: list[ConstraintBijector],
+    order: list[str] | None,
+    expected: list[str],
+) -> None:
+    assert flow_head(constrain(make_tanh_actor(), *bijectors, order=order)).order == expected
+
+
+# Actors of other shapes ---------------------------------------------------------------------------
+
+
+def test_a_policy_that_shares_its_body_with_a_critic(
+    make_tanh_actor: MakeActor,
+    network: nn.Module,
+    bijectors: list[ConstraintBijector],
+    unbound: TensorDictBase,
+) -> None:
+    body = TensorDictModule(nn.Linear(5, 5), in_keys=["observation"], out_keys=["observation"])
+    value = ValueOperator(nn.Linear(5, 1), in_keys=["observation"])
+    shared = ActorValueOperator(body, make_tanh_actor(), value)
+    actor = shared.get_policy_operator()
+    constrained = constrain(actor, *bijectors)
+    expected, got = act(actor, unbound), act(constrained, unbound)
+    torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
+    assert {id(each) for each in constrained.parameters()} == {id(p) for p in actor.parameters()}
+
+
+def test_an_actor_with_named_modules(
+    network: nn.Module, bijectors: list[ConstraintBijector], unbound: TensorDictBase
+) -> None:
+    body = TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"])
+    head = ProbabilisticTensorDictModule(
+        ["loc", "scale"], ["action"], distribution_class=TanhNormal
+    )
+    actor = ProbabilisticTensorDictSequential(OrderedDict(body=body, head=head))
+    constrained = constrain(actor, *bijectors, spec=Bounded(-1, 1, (2,)))
+    expected, got = act(actor, unbound), act(constrained, unbound)
+    torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
+
+
+def test_constraining_twice_keeps_both(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
+) -> None:
+    obstacle, battery = bijectors
+    once = constrain(make_tanh_actor(), battery, flow="radial")
+    twice = constrain(once, obstacle)
+    assert flow_head(once).order == ["battery"]
+    assert flow_head(twice).order == ["battery", "obstacle"]
+    both = constrain(make_tanh_actor(), battery, obstacle)
+    assert torch.equal(act(twice, state)["action"], act(both, state)["action"])
+    turned = constrain(once, obstacle, order=["obstacle", "battery"])
+    assert flow_head(turned).order == ["obstacle", "battery"]
+    with pytest.raises(ValueError, match="exactly once"):
+        constrain(once, battery)
+
+
+# What is refused ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "distribution",
+    [TruncatedNormal, TanhDelta, Delta, torch.distributions.Normal],
+    ids=lambda kind: kind.__name__,
+)
+def test_other_distributions_are_refused(make_tanh_actor: MakeActor, distribution: type) -> None:
+    message = f"expected TanhNormal or IndependentNormal.*given {distribution.__name__}; end"
+    with pytest.raises(TypeError, match=message):
+        constrain(make_tanh_actor(distribution_class=distribution))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        pytest.param({"distribution_kwargs": {"tanh_loc": True}}, "tanh_loc=True", id="moved loc"),
+        pytest.param({"distribution_kwargs": {"event_dims": 0}}, "event_dims = 1, given 0", id="0"),
+        pytest.param(
+            {"in_keys": ["loc"], "distribution_kwargs": {"scale": 0.1}},
+            "in_keys for 'loc' and 'scale', given ['loc']",
+            id="fixed scale",
+        ),
+        pytest.param(
+            {"in_keys": {"loc": "loc", "scale": "scale", "upscale": "u"}},
+            "given ['loc', 'scale', 'upscale']",
+            id="third parameter",
+        ),
+        pytest.param({"spec": None}, "the actor has none; pass constrain(..., spec=", id="no spec"),
+        pytest.param(
+            {"distribution_kwargs": {"low": -0.5, "high": 1.0}},
+            "spec's low [-1.0, -1.0], given -0.5; build it with distribution_kwargs={'low': ",
+            id="tighter TanhNormal",
+        ),
+        pytest.param(
+            {"spec": Bounded(-1, 2.0, (2,))}, "spec's high [2.0, 2.0], given 1.0", id="wider spec"
+        ),
+    ],
+)
+def test_what_would_change_silently_is_refused(
+    make_tanh_actor: MakeActor,
+    bijectors: list[ConstraintBijector],
+    options: dict[str, Any],
+    message: str,
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        constrain(make_tanh_actor(**options), *bijectors)
+
+
+def test_a_spec_can_be_handed_in(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
+) -> None:
+    actor = make_tanh_actor(spec=None)
+    constrained = constrain(actor, *bijectors, spec=Bounded(-1, 1, (2,)))
+    assert constrained(state)["action"].shape == (8, 2)
+
+
+def test_bounds_of_the_tanh_normal_may_be_tensors(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    spec = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 3.0]))
+    limits = {"low": spec.space.low, "high": spec.space.high}
+    head = flow_head(constrain(make_tanh_actor(spec=spec, distribution_kwargs=limits), *bijectors))
+    assert head.bounds.low.tolist() == [-1, 0]
+    assert head.bounds.high.tolist() == [1, 3]
+
+
+def test_what_is_no_actor_is_refused(network: nn.Module) -> None:
+    body = TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"])
+    for other in (network, body, TensorDictSequential(body)):
+        with pytest.raises(TypeError, match=f"actor: expected.*given {type(other).__name__}"):
+            constrain(other, ConstraintBijector("limit", Ball))  # type: ignore[arg-type]
+
+
+def test_what_is_not_constrained_has_no_flow(make_tanh_actor: MakeActor) -> None:
+    for needs_a_flow in (flow_head, with_reference_entropy, guarded):
+        with pytest.raises(TypeError, match="expected one that ends in a ConstrainedFlowModule"):
+            needs_a_flow(make_tanh_actor())
+
+
+def test_the_head_is_the_flow_module(make_actor: MakeActor) -> None:
+    actor = make_actor()
+    assert flow_head(actor) is actor.module[-1]
+    assert isinstance(flow_head(actor), ConstrainedFlowModule)

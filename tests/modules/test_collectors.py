@@ -1,0 +1,91 @@
+"""Constrained actors in TorchRL's collectors, whose weights are updated on the way."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import TransformedEnv
+
+from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.training.networks import gaussian_network
+
+MakeActor = Callable[..., Any]
+
+AGENTS, STEPS = 8, 5
+
+
+def shift(actor: Any) -> None:
+    """Change the weights so much that all locations show it."""
+    with torch.no_grad():
+        *_, bias = actor.parameters()
+        bias += 0.5
+
+
+def assert_acted_by(actor: Any, batch: TensorDictBase) -> None:
+    expected = actor.module[0](batch.select("observation").clone())
+    torch.testing.assert_close(batch["loc"], expected["loc"])
+    assert batch["next", "cost"].sum() == 0
+    density = actor.module[-1].get_dist(batch)
+    # `log_prob` inverts, in float32: only actions that are not saturated tell anything.
+    clear = (density.bijector.inv(batch["action"]).abs() < 3).all(-1)
+    assert clear.float().mean() > 0.5
+    scored = density.log_prob(batch["action"])
+    torch.testing.assert_close(batch["action_log_prob"][clear], scored[clear], rtol=0.02, atol=0.02)
+
+
+def test_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
+    actor = make_actor(return_log_prob=True)
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=AGENTS * STEPS,
+        total_frames=3 * AGENTS * STEPS,
+        auto_register_policy_transforms=False,
+    )
+    for batch in collector:
+        assert batch.shape == (AGENTS, STEPS)
+        assert_acted_by(actor, batch)
+        shift(actor)
+        collector.update_policy_weights_(TensorDict.from_module(actor).data)
+
+
+def _make_env(seed: int) -> TransformedEnv:
+    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
+    order = ["battery", "obstacle"]
+    return make_environment(
+        PointNavEnv((AGENTS,), seed=seed), geometries, order=order, with_centre=True
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_multi_sync_collector(workers: int) -> None:
+    env = _make_env(0)
+    network, spec = gaussian_network(5, 2, hidden=[8]), env.action_spec_unbatched
+    bijectors = constraint_bijectors(env)
+    actor = make_constrained_actor(network, spec, bijectors, return_log_prob=True)
+    collector = MultiSyncCollector(
+        [partial(_make_env, seed) for seed in range(workers)],
+        actor,
+        frames_per_batch=workers * AGENTS * STEPS,
+        total_frames=3 * workers * AGENTS * STEPS,
+        cat_results="stack",
+        auto_register_policy_transforms=False,
+    )
+    try:
+        batches = 0
+        for batch in collector:
+            batches += 1
+            assert batch.shape == (workers, AGENTS, STEPS)
+            assert_acted_by(actor, batch)
+            shift(actor)
+            collector.update_policy_weights_()
+        assert batches == 3
+    finally:
+        collector.shutdown()

@@ -1,0 +1,170 @@
+"""The last check of executed actions: it raises, it names, and it never repairs."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from cnfp_torchrl.modules import (
+    ConstraintViolationError,
+    ExecutedActionGuard,
+    SafeRandomPolicy,
+    flow_head,
+    guarded,
+)
+
+MakeActor = Callable[..., Any]
+
+AGENT = 2
+
+
+@pytest.fixture
+def guard(make_actor: MakeActor) -> ExecutedActionGuard:
+    return ExecutedActionGuard(flow_head(make_actor()))
+
+
+@pytest.fixture
+def acted(env: TransformedEnv) -> TensorDictBase:
+    """Safe actions in one state for all agents, beside the rectangle with little charge.
+
+    Each set is left by some actions that are inside the two others.
+    """
+    state = env.reset(position=(0.35, 0.25), battery=28)
+    return state.set("action", state["constraints", "centre"].clone())
+
+
+def set_action(acted: TensorDictBase, action: Tensor) -> TensorDictBase:
+    changed = acted["action"].clone()
+    changed[AGENT] = action
+    return acted.set("action", changed)
+
+
+def just_beyond(bound: Tensor, towards: float) -> Tensor:
+    return torch.nextafter(bound, torch.tensor(towards))
+
+
+def obstacle_edge(acted: TensorDictBase) -> Tensor:
+    """The leftmost allowed action, on the side of the station."""
+    low = acted["constraints", "obstacle", "low"][AGENT]
+    return torch.stack([low[0], torch.tensor(-0.9)])
+
+
+def battery_edge(acted: TensorDictBase, inwards: float) -> Tensor:
+    """An action near the edge of the battery's ball, away from the station."""
+    ball = acted["constraints", "battery"][AGENT].double()
+    way = torch.tensor([-0.4, 1.0]).double() - ball["center"]
+    direction = way / torch.linalg.vector_norm(way)
+    return (ball["center"] + direction * (ball["radius"] - inwards)).float()
+
+
+BREAKING = {
+    "bounds": lambda acted: just_beyond(torch.tensor([1.0, 0.0]), 2.0),
+    "battery": lambda acted: battery_edge(acted, -1e-5),
+    "obstacle": lambda acted: just_beyond(obstacle_edge(acted), -2.0),
+}
+
+
+def test_safe_actions_pass_untouched(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
+    before, entries = acted.clone(), dict(acted.items(True, True))
+    assert guard(acted) is acted
+    after = dict(acted.items(True, True))
+    assert after.keys() == entries.keys()
+    assert all(after[key] is entries[key] for key in entries)
+    assert (acted == before).all()
+
+
+def test_actions_on_the_edge_pass(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
+    for action in (torch.tensor([1.0, 0.0]), battery_edge(acted, 1e-5), obstacle_edge(acted)):
+        guard(set_action(acted, action))
+
+
+@pytest.mark.parametrize("name", BREAKING)
+def test_one_bad_action_raises_and_stays_as_it_is(
+    guard: ExecutedActionGuard, acted: TensorDictBase, name: str
+) -> None:
+    action = BREAKING[name](acted)
+    set_action(acted, action)
+    message = (
+        re.escape(
+            f"constraint '{name}': expected an action inside its set, given {action.tolist()}"
+        )
+        + r" with slack (?P<slack>\S+) at batch index "
+        + re.escape(f"[{AGENT}]")
+    )
+    with pytest.raises(ConstraintViolationError, match=message) as caught:
+        guard(acted)
+    found = re.search(message, str(caught.value))
+    assert found is not None
+    assert -1e-4 < float(found["slack"]) < 0
+    assert torch.equal(acted["action"][AGENT], action)
+
+
+def test_an_action_of_nan_raises(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
+    # Every comparison with it is false, so a check for "outside" would let it pass.
+    with pytest.raises(ConstraintViolationError, match=r"'bounds'.*\[nan, 0\.0\] with slack nan"):
+        guard(set_action(acted, torch.tensor([torch.nan, 0.0])))
+
+
+@pytest.mark.parametrize("name", ["battery", "obstacle"])
+def test_inactive_constraints_are_not_asked(
+    guard: ExecutedActionGuard, acted: TensorDictBase, name: str
+) -> None:
+    set_action(acted, BREAKING[name](acted))
+    flags = acted["constraints", name, "active"].clone()
+    flags[AGENT] = False
+    guard(acted.set(("constraints", name, "active"), flags))
+    flags = ~flags
+    with pytest.raises(ConstraintViolationError, match=f"constraint '{name}'"):
+        guard(acted.set(("constraints", name, "active"), flags))
+
+
+@pytest.mark.parametrize("index", [(), (1, 2)], ids=["unbatched", "two batch dimensions"])
+def test_the_index_has_the_batch_dimensions(
+    guard: ExecutedActionGuard, acted: TensorDictBase, index: tuple[int, ...]
+) -> None:
+    one = acted[AGENT].clone()
+    batched = one.expand(2, 3).clone() if index else one
+    guard(batched)
+    batched["action"][index] = torch.tensor([2.0, 0.0])
+    with pytest.raises(ConstraintViolationError, match=re.escape(f"at batch index {list(index)}")):
+        guard(batched)
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial"])
+def test_guarded_exact_flows_run_through(
+    env: TransformedEnv, make_actor: MakeActor, flow: str
+) -> None:
+    policy = guarded(make_actor(flow=flow))
+    rollout = env.rollout(50, policy, break_when_any_done=False)
+    assert rollout["next", "cost"].sum() == 0
+
+
+def test_guarded_actors_are_really_guarded(make_actor: MakeActor, state: TensorDictBase) -> None:
+    # A fault behind the flow.
+    actor = make_actor()
+    policy = guarded(actor)
+    policy(state.clone())
+    actor.module[-1].register_forward_hook(
+        lambda module, given, out: out.set("action", out["action"] + 3)
+    )
+    with pytest.raises(ConstraintViolationError, match="constraint 'bounds'"):
+        policy(state)
+
+
+@pytest.mark.parametrize("flow", ["squash", "none"])
+def test_flows_without_a_guarantee_are_not_guarded(make_actor: MakeActor, flow: str) -> None:
+    actor = make_actor(flow=flow)
+    assert guarded(actor) is actor
+
+
+def test_declared_keys_are_enough(make_actor: MakeActor, state: TensorDictBase) -> None:
+    head = flow_head(make_actor())
+    guard = ExecutedActionGuard(head)
+    SafeRandomPolicy(head)(state)
+    guard(state.select(*guard.in_keys))
+    assert guard.out_keys == ["action"]

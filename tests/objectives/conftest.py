@@ -1,0 +1,45 @@
+"""Transitions of point navigation, and what a loss needs to learn from them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+from torchrl.modules import ValueOperator
+
+from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.training.networks import action_value_network, gaussian_network
+
+MakeActor = Callable[..., Any]
+
+
+@pytest.fixture
+def env() -> TransformedEnv:
+    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
+    order = ["battery", "obstacle"]
+    return make_environment(PointNavEnv((64,), seed=0), geometries, order=order, with_centre=True)
+
+
+@pytest.fixture
+def make_actor(env: TransformedEnv) -> MakeActor:
+    def make(**options: Any) -> Any:
+        spec, bijectors = env.action_spec_unbatched, constraint_bijectors(env)
+        return make_constrained_actor(
+            gaussian_network(5, 2, hidden=[8]), spec, bijectors, **options
+        )
+
+    return make
+
+
+@pytest.fixture
+def critic() -> ValueOperator:
+    return action_value_network(5, 2, hidden=[8])
+
+
+@pytest.fixture
+def transitions(env: TransformedEnv, make_actor: MakeActor) -> TensorDictBase:
+    """256 transitions, of which some constraints bind."""
+    return env.rollout(4, make_actor(), break_when_any_done=False).detach().reshape(-1)
