@@ -10,6 +10,7 @@ from cnfp_torchrl.envs.point_nav import PointNavEnv
 from cnfp_torchrl.envs.point_nav_geometry import BatteryGeometry, ObstacleGeometry
 from cnfp_torchrl.envs.rendering import render_point_nav
 from cnfp_torchrl.envs.shortest_path import ShortestPath
+from cnfp_torchrl.envs.visible_geometry import VisibleObstacleGeometry
 
 register()
 
@@ -27,6 +28,7 @@ __all__ = [
     "ShortestPath",
     "State",
     "Transition",
+    "VisibleObstacleGeometry",
     "constraint_bijectors",
     "constraint_names",
     "render_point_nav",

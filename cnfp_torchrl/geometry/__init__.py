@@ -9,6 +9,7 @@ from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.positive_part import PositivePart
 from cnfp_torchrl.geometry.region import Region
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
+from cnfp_torchrl.geometry.visible_or_box import VisibleOrBox
 from cnfp_torchrl.geometry.visible_region import VisibleRegion
 from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
 
@@ -26,6 +27,7 @@ __all__ = [
     "Region",
     "Rows",
     "Superlevel",
+    "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
     "chebyshev_centre",

@@ -1,0 +1,61 @@
+r"""The allowed moves of point navigation without the paper's box: everything in sight.
+
+**What is guaranteed.** No move touches an obstacle, on any layout and from every position outside
+the rectangles. The battery's guarantee (`cnfp_torchrl.envs.point_nav_geometry`) holds on layouts
+where the nearest station is in sight from everywhere, as on the reference layout: a move that the
+battery's ball allows ends at a place from which the nearest station is within reach. On others the
+box keeps the way open, which the visible region does not.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.layout import Layout
+from cnfp_torchrl.envs.point_nav_geometry import ObstacleGeometry, read_observation
+from cnfp_torchrl.envs.shortest_path import MARGIN
+from cnfp_torchrl.geometry import VisibleOrBox, VisibleRegion
+
+
+class VisibleObstacleGeometry(GeometryTransform):
+    """All moves whose straight way touches no obstacle: not convex, and less timid than a box.
+
+    Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
+    it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it may
+    leave out the zero action and so leads away.
+
+    Args:
+        layout: the map; None takes the reference task.
+        name: the constraint's name.
+        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
+    """
+
+    def __init__(
+        self,
+        layout: Layout | None = None,
+        name: str = "obstacle",
+        observation_key: str = "observation",
+    ) -> None:
+        super().__init__(name, [observation_key])
+        self._box = ObstacleGeometry(layout, name, observation_key)
+        self.layout = self._box.layout
+        wall = torch.full((2,), self.layout.wall - MARGIN)
+        corners = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
+        grown = corners + MARGIN * torch.tensor([[-1.0], [1.0]])
+        self.register_buffer("_obstacles", torch.cat([grown, VisibleRegion.walls(-wall, wall)]))
+
+    def constraint_set(self, tensordict: TensorDictBase) -> VisibleOrBox:
+        """Return the moves in sight, or the box (docs/method.md, section 4)."""
+        position, _ = read_observation(tensordict, self.in_keys[0])
+        obstacles = self._obstacles.expand(*position.shape[:-1], *self._obstacles.shape)
+        step = torch.full_like(position[..., 0], self.layout.step_length)
+        region = VisibleRegion(position, obstacles, step, validate_args=False)
+        room = region.slack(torch.zeros_like(position)) >= MARGIN / self.layout.step_length
+        return VisibleOrBox(
+            **region.fields(),
+            **self._box.constraint_set(tensordict).fields(),
+            in_sight=room.to(position.dtype),
+            validate_args=False,
+        )
