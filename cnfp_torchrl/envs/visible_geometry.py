@@ -23,8 +23,8 @@ class VisibleObstacleGeometry(GeometryTransform):
     """All moves whose straight way touches no obstacle: not convex, and less timid than a box.
 
     Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
-    it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it may
-    leave out the zero action and so leads away.
+    it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it
+    may leave out the zero action and so leads away.
 
     Args:
         layout: the map; None takes the reference task.

@@ -10,6 +10,7 @@ from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, Missing
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.flows import ExactFlow, Flow, PaperChain, RadialFlow, UnconstrainedFlow
 from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
+from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
@@ -19,6 +20,8 @@ __all__ = [
     "ExactFlow",
     "ExecutedActionGuard",
     "Flow",
+    "FlowMap",
+    "LatentActor",
     "MissingGeometryError",
     "PaperChain",
     "RadialFlow",
@@ -29,5 +32,6 @@ __all__ = [
     "flow_head",
     "guarded",
     "make_constrained_actor",
+    "split_at_latent",
     "with_reference_entropy",
 ]

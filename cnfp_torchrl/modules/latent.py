@@ -77,7 +77,8 @@ class LatentGaussian(IndependentNormal):
     """
 
     def __init__(self, flow: ConstrainedFlow) -> None:
-        gaussian = flow.base_dist.base_dist
+        independent: Any = flow.base_dist
+        gaussian = independent.base_dist
         super().__init__(gaussian.loc, gaussian.scale, validate_args=False)
         self.flow = flow
 
@@ -110,6 +111,17 @@ class LatentScorer(SafeProbabilisticModule):
     build_dist_from_params = get_dist
 
 
+class LatentActorModule(SafeProbabilisticTensorDictSequential):
+    """An actor that ends in a `LatentScorer`."""
+
+    def build_dist_from_params(self, tensordict: TensorDictBase) -> LatentGaussian:
+        """Return the distribution over latents.
+
+        tensordict's own method takes the innermost probabilistic module: the scorer's flow module.
+        """
+        return _parts(self)[-1].get_dist(tensordict)
+
+
 class LatentActor(NamedTuple):
     """A constrained actor cut at its latent; the networks are the actor's own.
 
@@ -120,7 +132,7 @@ class LatentActor(NamedTuple):
     """
 
     policy: TensorDictSequential
-    base: SafeProbabilisticTensorDictSequential
+    base: LatentActorModule
 
 
 def split_at_latent(
@@ -139,8 +151,8 @@ def split_at_latent(
 
     The ratios are exact however saturated the actions are, and so are divergences between two
     policies, which the flow leaves as they are. The entropy bonus is a Monte-Carlo estimate of the
-    action's entropy, one sample a state whatever ``samples_mc_entropy``; for the reference entropy
-    pass ``with_reference_entropy(actor)``; for none, ``entropy_coeff=0`` or ``entropy_bonus=False``.
+    action's entropy, one sample a state whatever ``samples_mc_entropy``. For the reference entropy
+    pass ``with_reference_entropy(actor)``; for none, give the loss ``entropy_bonus=False``.
 
     Args:
         actor: a constrained actor; parameters are shared, not copied.
@@ -164,5 +176,5 @@ def split_at_latent(
     sampler = SafeProbabilisticModule(distribution_class=IndependentNormal, **options)
     return LatentActor(
         policy=TensorDictSequential(*body, sampler, FlowMap(head, latent_key)),
-        base=SafeProbabilisticTensorDictSequential(*body, LatentScorer(head, **options)),
+        base=LatentActorModule(*body, LatentScorer(head, **options)),
     )

@@ -20,6 +20,7 @@ from cnfp_torchrl.envs.indicators import leaves_arena, segment_touches_rectangle
 from cnfp_torchrl.geometry import VisibleOrBox
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
+ANGLES = torch.arange(200.0)
 LAYOUTS = {
     "reference": Layout(),
     "empty": Layout(rectangles=()),
@@ -29,7 +30,9 @@ LAYOUTS = {
 }
 
 
-def make_env(layout: Layout, agents: int, flow: str) -> tuple[TransformedEnv, ConstrainedFlowModule]:
+def make_env(
+    layout: Layout, agents: int, flow: str
+) -> tuple[TransformedEnv, ConstrainedFlowModule]:
     env = TransformedEnv(
         PointNavEnv([agents], layout=layout, seed=0),
         Compose(BatteryGeometry(layout), VisibleObstacleGeometry(layout)),
@@ -52,7 +55,7 @@ def test_specs(batch: tuple[int, ...]) -> None:
     [
         lambda: torch.randn(200, 2),
         lambda: torch.randn(200, 2) * 1e6,
-        lambda angle=torch.arange(200.0): 1e6 * torch.stack([angle.cos(), angle.sin()], -1),
+        lambda: 1e6 * torch.stack([ANGLES.cos(), ANGLES.sin()], -1),
     ],
     ids=["gaussian", "hostile", "constant"],
 )
