@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 
-from cnfp_torchrl.envs import ConstraintCentre, GeometryTransform, constraint_bijectors
+from cnfp_torchrl.envs import (
+    ConstraintCentre,
+    GeometryTransform,
+    constraint_bijectors,
+    constraint_names,
+)
 
 
 def make_environment(
@@ -37,3 +42,8 @@ def make_environment(
     if with_centre:
         env.append_transform(ConstraintCentre(constraint_bijectors(env), order))
     return env
+
+
+def counted_constraints(env: EnvBase) -> tuple[str, ...]:
+    """Return the names of the columns of ``cost``; none if the environment counts nothing."""
+    return constraint_names(env) if "cost" in env.observation_spec.keys() else ()  # noqa: SIM118

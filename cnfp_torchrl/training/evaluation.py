@@ -12,6 +12,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cnfp_torchrl.training.environment import counted_constraints
+
 
 @dataclass(frozen=True)
 class LinearScore:
@@ -91,7 +93,7 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes: expected a number >= 1, given {episodes}")
-    names = tuple(getattr(env, "constraint_names", None) or ())
+    names = counted_constraints(env)
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns: list[Tensor] = []
     costs: list[Tensor] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
@@ -39,7 +40,9 @@ class Metrics:
         self._returns: list[Tensor] = []
         self._losses: dict[str, list[Tensor]] = defaultdict(list)
         self._last_return = math.nan
-        self._bar = tqdm(total=total_frames, unit="step", dynamic_ncols=True)
+        # In a file each redrawing of the bar is another line.
+        pause = 0.1 if sys.stderr.isatty() else 10.0
+        self._bar = tqdm(total=total_frames, unit="step", dynamic_ncols=True, mininterval=pause)
 
     def add_steps(self, batch: TensorDictBase) -> None:
         """Count a batch ``(steps,)`` of transitions."""

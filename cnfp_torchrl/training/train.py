@@ -15,9 +15,9 @@ from tensordict import TensorDictBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import config_directory
-from cnfp_torchrl.envs import constraint_names
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import build_actor, build_critic, build_environment
+from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, evaluate
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -59,7 +59,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     folder.save_config(config)
     metrics = Metrics(
         [make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()],
-        constraint_names(env),
+        counted_constraints(env),
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
