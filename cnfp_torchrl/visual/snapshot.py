@@ -1,0 +1,190 @@
+"""Everything that happens inside a flow policy in one state, as plain tensors on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.linalg import vector_norm
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.modules import flow_head
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of a flow made of the base samples.
+
+    Args:
+        name: of the constraint, or ``bounds``.
+        samples: ``(n, d)``.
+        log_density: of those samples in the distribution after this stage, ``(n,)``.
+        applied: indices into the region's sets of those applied so far, this one last.
+        active: whether the constraint holds in this state; a dropped one changes nothing.
+    """
+
+    name: str
+    samples: Tensor
+    log_density: Tensor
+    applied: tuple[int, ...]
+    active: bool
+
+
+@dataclass(frozen=True)
+class FlowSnapshot:
+    """A flow policy in one state: base samples, what each stage makes of them, and the sets.
+
+    The first sample is the executed one, and its path is followed unless another is chosen.
+
+    Args:
+        state: the state, as the actor saw it, of batch size ``()``.
+        loc: of the Gaussian base, ``(d,)``.
+        scale: of the Gaussian base, ``(d,)``.
+        latents: base samples, ``(n, d)``.
+        latent_log_density: ``(n,)``.
+        stages: in order of application.
+        region: sets (``sets[0]`` the action bounds), centre and active flags of this state.
+        constraint_names: of ``region.sets[1:]``, in order of application.
+        is_exact: whether the flow drops what cannot hold and keeps everything else.
+        through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
+            log-densities ``(stages, n)``.
+        followed: index of the sample whose path through the stages is drawn.
+    """
+
+    state: TensorDictBase
+    loc: Tensor
+    scale: Tensor
+    latents: Tensor
+    latent_log_density: Tensor
+    stages: tuple[Stage, ...]
+    region: Region
+    constraint_names: tuple[str, ...]
+    is_exact: bool
+    through_stages: Callable[[Tensor], tuple[Tensor, Tensor]]
+    followed: int = 0
+
+    @property
+    def dim(self) -> int:
+        """The dimension d of the action space."""
+        return int(self.latents.shape[-1])
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """The constraints that cannot hold together with those of higher priority here."""
+        return tuple(n for k, n in enumerate(self.constraint_names, 1) if not self.is_active(k))
+
+    def is_active(self, index: int) -> bool:
+        """Tell whether ``region.sets[index]`` holds in this state."""
+        return _is_active(self.region, index)
+
+    def outside(self, stage: int) -> Tensor:
+        """Tell, with zero tolerance, which samples lie outside the active sets so far, ``(n,)``.
+
+        After the last stage, whose samples are executed, every set counts, applied or not.
+        """
+        samples = self.stages[stage].samples
+        last = stage + 1 == len(self.stages)
+        outside = torch.zeros(samples.shape[:-1], dtype=torch.bool)
+        for index in range(len(self.region.sets)) if last else self.stages[stage].applied:
+            if self.is_active(index):
+                outside |= ~self.region.sets[index].contains(samples)
+        return outside
+
+    def allowed_share(self, draws: int = 4096) -> float:
+        """Return which share of the action bounds is allowed, by drawing actions uniformly."""
+        bounds = self.region.bounds
+        generator = torch.Generator().manual_seed(0)
+        uniform = torch.rand(draws, self.dim, generator=generator).to(bounds.low)
+        actions = bounds.low + (bounds.high - bounds.low) * uniform
+        return float(self.region.contains(actions).double().mean())
+
+    def path(self) -> Tensor:
+        """Return the followed sample after each stage, ``(stages, d)``."""
+        return torch.stack([stage.samples[self.followed] for stage in self.stages])
+
+    def following_the_longest_path(self) -> FlowSnapshot:
+        """Return the same snapshot, following the sample that the stages move farthest."""
+        ways = torch.stack([stage.samples for stage in self.stages]).diff(dim=0)
+        return replace(self, followed=int(vector_norm(ways, dim=-1).sum(0).argmax()))
+
+
+@torch.no_grad()
+def take_snapshot(
+    actor: SafeProbabilisticTensorDictSequential,
+    state: TensorDictBase,
+    *,
+    samples: int = 800,
+    seed: int = 0,
+) -> FlowSnapshot:
+    """Return what a constrained actor does in one state.
+
+    Args:
+        actor: from `make_constrained_actor` or `constrain`.
+        state: of batch size ``()``, with geometry, centre and active flags; not changed.
+        samples: how many base samples to draw.
+        seed: of those; torch's global generator is left alone.
+
+    Raises:
+        ValueError: when the state is a batch.
+    """
+    if state.batch_size != torch.Size():
+        raise ValueError(
+            f"state: expected one state (batch size ()), given {tuple(state.batch_size)}; index it"
+        )
+    head = flow_head(actor)
+    # The actor's own sampling must not advance the generator of a training run that goes on.
+    with torch.random.fork_rng(devices=[]):
+        state = actor(state.clone())
+    distribution = head.get_dist(state)
+    loc, scale = (state.get(key) for key in head.parameter_keys)
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(samples, loc.shape[-1], generator=generator).to(loc)
+    latents = loc + scale * noise
+
+    def through_stages(latents: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            given = latents.to(loc)
+            actions, log_dets = distribution.stages(given)
+            log_density = distribution.base_dist.log_prob(given) - log_dets
+        return actions.cpu(), log_density.cpu()
+
+    region = _on_host(head.get_region(state))
+    actions, log_density = through_stages(latents)
+    stages = tuple(
+        Stage(name, actions[i], log_density[i], applied, _is_active(region, applied[-1]))
+        for i, (name, applied) in enumerate(_applied(head.stage_names, head.order))
+    )
+    return FlowSnapshot(
+        state=state.cpu(),
+        loc=loc.cpu(),
+        scale=scale.cpu(),
+        latents=latents.cpu(),
+        latent_log_density=distribution.base_dist.log_prob(latents).cpu(),
+        stages=stages,
+        region=region,
+        constraint_names=tuple(head.order),
+        is_exact=head.flow.is_exact,
+        through_stages=through_stages,
+    )
+
+
+def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, ...]]]:
+    """Return each stage's name with the indices of the sets applied so far."""
+    index = {"bounds": 0} | {name: k for k, name in enumerate(order, 1)}
+    return [(name, tuple(index[n] for n in stages[: i + 1])) for i, name in enumerate(stages)]
+
+
+def _is_active(region: Region, index: int) -> bool:
+    return region.active is None or bool(region.active[index])
+
+
+def _on_host(region: Region) -> Region:
+    def moved(each: ConstraintSet) -> ConstraintSet:
+        return each.with_fields(lambda value, _: value.cpu())
+
+    active = None if region.active is None else region.active.cpu()
+    return Region(tuple(moved(each) for each in region.sets), region.centre.cpu(), active)

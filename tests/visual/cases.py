@@ -1,0 +1,88 @@
+"""Flow policies in hand-made states."""
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.data import Bounded
+
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    HalfSpaces,
+    PositivePart,
+    Region,
+    VisibleRegion,
+    WeightedL1Ball,
+)
+from cnfp_torchrl.modules import ConstraintBijector, make_constrained_actor
+from cnfp_torchrl.visual import FlowSnapshot, take_snapshot
+
+t = torch.tensor
+
+# Each binds somewhere in the action bounds [-1, 1]^d, and no two are the same.
+PLANE: dict[str, ConstraintSet] = {
+    "battery": Ball(t([0.6, 0.0]), t(0.9)),
+    "obstacle": Box(t([-1.0, -1.0]), t([0.5, 0.4])),
+    "speed": Ball(t([0.0, 0.0]), t(0.8)),
+}
+PLANE_OF_OTHERS: dict[str, ConstraintSet] = {
+    "visible": VisibleRegion(t([0.0, 0.0]), t([[[0.2, -0.1], [0.4, 0.3]]]), t(1.0)),
+    "power": PositivePart(t([1.0, 1.0]), t(1.1)),
+    "diamond": WeightedL1Ball(t([1.0, 0.8]), t(0.9)),
+}
+CONFLICT: dict[str, ConstraintSet] = {
+    "far": Ball(t([1.3, 1.3]), t(0.5)),
+    "near": Ball(t([-0.5, -0.5]), t(0.6)),
+}
+LINE: dict[str, ConstraintSet] = {"box": Box(t([-0.7]), t([0.4])), "ball": Ball(t([0.4]), t(0.6))}
+SPACE: dict[str, ConstraintSet] = {
+    "ball": Ball(t([0.3, 0.0, 0.2]), t(0.8)),
+    "half": HalfSpaces(t([[1.0, 1.0, 1.0]]), t([0.5])),
+}
+
+
+class Gaussian(nn.Module):
+    """The same location and scale in every state."""
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        super().__init__()
+        self.loc, self.scale = loc, scale
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        batch = observation.shape[:-1]
+        return self.loc.expand(*batch, -1), self.scale.expand(*batch, -1)
+
+
+def first(sets: Mapping[str, ConstraintSet], count: int) -> dict[str, ConstraintSet]:
+    return dict(list(sets.items())[:count])
+
+
+def make_snapshot(
+    sets: Mapping[str, ConstraintSet],
+    flow: str = "exact",
+    *,
+    dim: int = 2,
+    loc: Tensor | None = None,
+    scale: Tensor | None = None,
+    samples: int = 200,
+) -> FlowSnapshot:
+    region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
+    assert region.active is not None
+    state = TensorDict({"observation": torch.zeros(3)}, [])
+    state["constraints", "centre"] = region.centre
+    for k, (name, each) in enumerate(sets.items(), start=1):
+        state["constraints", name, "active"] = region.active[k]
+        for field, value in each.fields().items():
+            state["constraints", name, field] = value
+    actor = make_constrained_actor(
+        Gaussian(
+            torch.zeros(dim) if loc is None else loc, torch.ones(dim) if scale is None else scale
+        ),
+        Bounded(-torch.ones(dim), torch.ones(dim)),
+        [ConstraintBijector(name, type(each)) for name, each in sets.items()],
+        flow=flow,
+    )
+    return take_snapshot(actor, state, samples=samples)

@@ -1,0 +1,32 @@
+"""What to ask of a picture."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from cnfp_torchrl.visual import density, states
+from cnfp_torchrl.visual.canvas import save_png
+
+
+def is_a_picture(path: Path) -> bool:
+    """Tell whether a file is a PNG of some size with more to it than a few flat colours."""
+    with Image.open(path) as image:
+        colours = image.convert("RGB").getcolors(maxcolors=2**24)
+        return image.format == "PNG" and min(image.size) > 100 and len(colours) > 40
+
+
+@pytest.fixture
+def draws(tmp_path: Path) -> Callable[[Figure], bool]:
+    """Whether a figure comes out as a picture."""
+    return lambda figure: is_a_picture(save_png(figure, tmp_path / "figure.png", dpi=60))
+
+
+@pytest.fixture(autouse=True)
+def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coarser grids and fewer candidate states than in real figures, to be quick."""
+    monkeypatch.setattr(density, "_NODES", 41)
+    monkeypatch.setattr(density, "_NODES_IN_ONE", 201)
+    monkeypatch.setattr(states, "_CANDIDATES", 256)
