@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, TransformedDistribution
+from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
+from torch.distributions.utils import _standard_normal
 
 from cnfp_torchrl.bijectors import Bijector, Stages
 from cnfp_torchrl.bijectors.bijector import broadcast_shape
@@ -52,9 +54,9 @@ class ConstrainedFlow(TransformedDistribution):
 
     def rsample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
         """Return reparametrised actions ``(*sample, *batch, d)`` and their log-densities."""
-        latent = _checked(self.base_dist.rsample(torch.Size(sample_shape)))
-        action, log_det = self._forward_and_scored_log_det(latent)
-        return action, self.base_dist.log_prob(latent) - log_det
+        latent, latent_log_prob = _rsample_and_log_prob(self.base_dist, torch.Size(sample_shape))
+        action, log_det = self._forward_and_scored_log_det(_checked(latent))
+        return action, latent_log_prob - log_det
 
     def sample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
         """Return actions ``(*sample, *batch, d)`` without gradients and their log-densities.
@@ -147,3 +149,19 @@ def _checked(latent: Tensor) -> Tensor:
             "parameters (half precision cannot hold a boundary with zero tolerance)"
         )
     return latent
+
+
+def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor, Tensor]:
+    """Draw from a base and score the draw.
+
+    A Gaussian's noise is scored where it is drawn: recovering it as (z - loc) / scale would lose it
+    to rounding where the scale is small beside the location, and costs more.
+    """
+    gaussian = base.base_dist if isinstance(base, Independent) else None
+    if type(gaussian) is not Normal or base.reinterpreted_batch_ndims != 1:
+        latent = base.rsample(shape)
+        return latent, base.log_prob(latent)
+    loc, scale = gaussian.loc, gaussian.scale
+    noise = _standard_normal((*shape, *loc.shape), dtype=loc.dtype, device=loc.device)
+    log_prob = -(0.5 * noise.square()).sum(-1) - scale.log().sum(-1)
+    return loc + scale * noise, log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]

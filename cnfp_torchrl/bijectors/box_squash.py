@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.hyperbolic import log_sech_squared
+from cnfp_torchrl.bijectors.hyperbolic import sum_of_log_sech_squared
 from cnfp_torchrl.geometry import Box, GeometryError
 
 
@@ -28,22 +30,32 @@ class BoxSquash(Bijector):
     """
 
     def __init__(self, low: Tensor, high: Tensor, *, validate_args: bool = True) -> None:
-        super().__init__()
         box = Box(low, high, validate_args=validate_args)
-        if validate_args and bool(low.isinf().any() | high.isinf().any()):
+        self._set_image(box.eroded(), validate_args)
+
+    @classmethod
+    def onto(cls, image: Box, *, validate_args: bool = True) -> Self:
+        """Return the squash onto a box that is eroded already."""
+        squash = cls.__new__(cls)
+        squash._set_image(image, validate_args)
+        return squash
+
+    def _set_image(self, image: Box, validate_args: bool) -> None:
+        super().__init__()
+        if validate_args and bool(image.low.isinf().any() | image.high.isinf().any()):
             raise GeometryError(
-                f"BoxSquash: expected finite bounds, given low {low.tolist()}, high "
-                f"{high.tolist()}; an unbounded box has no tanh squash, use it as a constraint "
-                "inside action bounds"
+                f"BoxSquash: expected finite bounds, given low {image.low.tolist()}, high "
+                f"{image.high.tolist()}; an unbounded box has no tanh squash, use it as a "
+                "constraint inside action bounds"
             )
-        eroded = box.eroded()
-        if validate_args and not bool((eroded.low < eroded.high).all()):
+        if validate_args and not bool((image.low < image.high).all()):
             raise GeometryError(
-                f"BoxSquash: expected bounds further apart than rounding error in {low.dtype}, "
-                f"given low {low.tolist()}, high {high.tolist()}"
+                f"BoxSquash: expected bounds further apart than rounding error in "
+                f"{image.low.dtype}, given low {image.low.tolist()}, high {image.high.tolist()} "
+                "after erosion"
             )
-        self._middle = (eroded.low + eroded.high) / 2
-        self._half = (eroded.high - eroded.low) / 2
+        self._middle = (image.low + image.high) / 2
+        self._half = (image.high - image.low) / 2
 
     @property
     def shape(self) -> torch.Size:
@@ -57,11 +69,11 @@ class BoxSquash(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         action = self._middle + self._half * latent.tanh()
-        return action, (self._half.log() + log_sech_squared(latent)).sum(-1)
+        return action, self._half.log().sum(-1) + sum_of_log_sech_squared(latent)
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         latent = ((action - self._middle) / self._half).atanh()
-        return latent, -(self._half.log() + log_sech_squared(latent)).sum(-1)
+        return latent, -(self._half.log().sum(-1) + sum_of_log_sech_squared(latent))
 
     def contains(self, action: Tensor) -> Tensor:
         return (((action - self._middle) / self._half).abs() < 1).all(-1)

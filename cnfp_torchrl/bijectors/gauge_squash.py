@@ -32,12 +32,15 @@ class GaugeSquash(Bijector):
 
     def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
-        self._box = BoxSquash(region.bounds.low, region.bounds.high, validate_args=validate_args)
+        if validate_args:
+            region.bounds.validate()
         eroded = region.eroded()
+        self._box = BoxSquash.onto(eroded.bounds, validate_args=validate_args)
         # The very bounds of the squash in floating point, not a rounding away from them: a gauge of
         # 1 + e at the bounds would let the last stage overshoot by e times the distance to the
         # centre, and near a bound one rounding error is a large e.
-        self.region = Region((self._box.image, *eroded.sets[1:]), region.centre, region.active)
+        sets = (self._box.image, *eroded.sets[1:])
+        self.region = Region(sets, region.centre, region.active, validate_args=False)
 
     @property
     def shape(self) -> torch.Size:

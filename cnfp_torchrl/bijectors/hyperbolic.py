@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
+from torch.nn.functional import logsigmoid
 
 SMALL = 0.01
 
@@ -24,13 +24,17 @@ _ATANHC = tuple(1 / (2 * k + 1) for k in range(8))
 
 
 def log_sech_squared(x: Tensor) -> Tensor:
-    r"""Return :math:`L(x) = \log(1 - \tanh^2 x) = 2(\log 2 - |x| - \mathrm{softplus}(-2|x|))`.
+    r"""Return :math:`L(x) = \log(1 - \tanh^2 x) = 2(\log 2 - x + \log\sigma(2x))`.
 
-    The function is even; of the two forms this one never meets the argument above which torch
-    replaces softplus by the identity (an error of 4e-9 in float64).
+    Not by softplus, which torch replaces by the identity above an argument of 20 (an error of 4e-9
+    in float64).
     """
-    size = x.abs()
-    return 2 * (math.log(2) - size - softplus(-2 * size))
+    return 2 * (math.log(2) - x + logsigmoid(2 * x))
+
+
+def sum_of_log_sech_squared(x: Tensor) -> Tensor:
+    """Return the sum of `log_sech_squared` over the last dimension, with fewer passes over it."""
+    return 2 * ((logsigmoid(2 * x) - x).sum(-1) + x.shape[-1] * math.log(2))
 
 
 def tanhc(q: Tensor) -> Tensor:

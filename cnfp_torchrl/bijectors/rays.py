@@ -28,7 +28,9 @@ def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
     zero = length < torch.finfo(offset.dtype).tiny ** 0.5
     if offset.shape[-1] == 1:
         offset = offset.detach()
-    return torch.where(zero, 1.0, offset) / torch.where(zero, 1.0, length), zero.squeeze(-1)
+    # Arithmetic, because torch.where is slow where the mask broadcasts.
+    one = zero.to(offset.dtype)
+    return (offset + one) / (length + one), zero.squeeze(-1)
 
 
 def region_shape(region: Region) -> torch.Size:
@@ -60,7 +62,7 @@ def is_inside(offset: Tensor, gauge: Tensor, zero: Tensor) -> Tensor:
 
 
 def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:
-    """Return ``centre + factor (point - centre)``, and the very point where the factor is 1.
+    """Return ``centre + factor (point - centre)``.
 
     Not ``point - (1 - factor) (point - centre)``: in a small region that would round at the scale
     of the point instead of the region's.
@@ -70,5 +72,4 @@ def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:
         point: ``(*batch, d)``.
         factor: ``(*batch,)``.
     """
-    factor = factor.unsqueeze(-1)
-    return torch.where(factor == 1, point, centre + factor * (point - centre))
+    return centre + factor.unsqueeze(-1) * (point - centre)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
@@ -51,12 +52,17 @@ class ConstraintCentre(Transform):
         ValueError: when an order does not name each constraint exactly once.
     """
 
+    _low: Tensor | None
+    _high: Tensor | None
+
     def __init__(
         self, bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None = None
     ) -> None:
         super().__init__()
         self._bijectors = in_order(bijectors, order)
-        self._bounds: Box | None = None
+        # Of the action bounds, read from the parent once; buffers, to move with the environment.
+        self.register_buffer("_low", None, persistent=False)
+        self.register_buffer("_high", None, persistent=False)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         bounds = self._action_bounds()
@@ -101,12 +107,13 @@ class ConstraintCentre(Transform):
         return observation_spec
 
     def _action_bounds(self) -> Box:
-        if self._bounds is None:
+        if self._low is None or self._high is None:
             if self.parent is None:
                 raise RuntimeError(
                     "ConstraintCentre: expected to be part of an environment, which knows the "
                     "action bounds, before use; append it with TransformedEnv(env, Compose(..., "
                     "this)), and to a replay buffer a clone() of an environment's own"
                 )
-            self._bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
-        return self._bounds
+            bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
+            self._low, self._high = bounds.low, bounds.high
+        return Box(self._low, self._high, validate_args=False)

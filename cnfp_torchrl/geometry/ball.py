@@ -80,6 +80,12 @@ class Ball(ConstraintSet):
         identity = torch.eye(self.dim, dtype=self.dtype, device=self.center.device)
         return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
 
+    def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
+        # The radius alone, because torch.where is slow where the mask broadcasts.
+        around = vector_norm(centre - self.center, dim=-1) + 1
+        radius = torch.where(active, self.radius, around)
+        return type(self)(self.center, radius, validate_args=False)
+
     def inner_ball(self, radius: float) -> Self:
         r"""Return the ball of at most the given radius inside this one that is nearest to 0.
 

@@ -33,10 +33,15 @@ class ConstraintSet(ABC):
     states
 
     - `event_dims`: the number of event dimensions of each field,
-    - `violations`: what makes field values invalid beyond shapes, dtypes and NaN,
-    - `slack`, `gauge`, `contains`, `bounding_box`: its geometry,
+    - `slack`, `gauge`: its geometry,
     - `eroded`: the set moved inwards by the rounding error of its own arithmetic,
-    - `unit_about`: any well-conditioned set of the family around a point.
+    - `unit_about`: any well-conditioned set of the family around a point,
+
+    and, where there is more to say than the defaults do,
+
+    - `violations`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
+    - `contains`, `bounding_box`: by default by `slack` and without bounds,
+    - `superlevel`: what the search for centres needs to be fast.
 
     Constructing a set checks it, which reads tensors on the host. Hot paths, whose values were
     checked where they entered, construct with ``validate_args=False``.
@@ -53,18 +58,6 @@ class ConstraintSet(ABC):
             self.validate()
 
     # What a family states -------------------------------------------------------------------------
-
-    @abstractmethod
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
-        """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
-
-    @abstractmethod
-    def contains(self, action: Tensor) -> Tensor:
-        """Tell, with zero tolerance, whether each action ``(*batch, d)`` lies in its set.
-
-        The arithmetic is done in float64 whatever the dtype, so that the answer concerns the given
-        numbers and not the rounding of the test.
-        """
 
     @abstractmethod
     def slack(self, action: Tensor) -> Tensor:
@@ -85,10 +78,6 @@ class ConstraintSet(ABC):
         """
 
     @abstractmethod
-    def bounding_box(self) -> Box:
-        """Return a box around the set; its bounds are infinite where the set has no end."""
-
-    @abstractmethod
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         """Return the set moved inwards by a few units of rounding error, absolutely.
 
@@ -99,6 +88,26 @@ class ConstraintSet(ABC):
     @abstractmethod
     def unit_about(self, centre: Tensor) -> Self:
         """Return a set of this family, of size one, about a point, with fields shaped as here."""
+
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
+        yield from ()
+
+    def contains(self, action: Tensor) -> Tensor:
+        """Tell, with zero tolerance, whether each action ``(*batch, d)`` lies in its set.
+
+        The arithmetic is done in float64 whatever the dtype, so that the answer concerns the given
+        numbers and not the rounding of the test.
+        """
+        return self.with_fields(lambda field, _: field.double()).slack(action.double()) >= 0
+
+    def bounding_box(self) -> Box:
+        """Return a box around the set; its bounds are infinite where none are known."""
+        from cnfp_torchrl.geometry.box import Box
+
+        like = next(iter(self.fields().values()))
+        high = torch.full((self.dim,), torch.inf, dtype=like.dtype, device=like.device)
+        return Box(-high, high, validate_args=False)
 
     def superlevel(self) -> Superlevel | None:
         """Describe the actions with a slack of at least t, for the search for centres.
@@ -155,6 +164,15 @@ class ConstraintSet(ABC):
             },
             validate_args=False,
         )
+
+    def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
+        """Return the set where it is active, and one of its family that holds the centre elsewhere.
+
+        Args:
+            active: boolean ``(*batch,)``.
+            centre: ``(*batch, d)``, inside the set where it is active.
+        """
+        return self.where(active, self.unit_about(centre))
 
     def validate(self, name: str | None = None) -> Self:
         """Return the set itself, or refuse it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from typing import Self
 
 import torch
@@ -30,8 +30,11 @@ class Region:
     sets: tuple[ConstraintSet, ...]
     centre: Tensor
     active: Tensor | None = None
+    validate_args: InitVar[bool] = True
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, validate_args: bool) -> None:
+        if not validate_args:
+            return
         if not self.sets or not isinstance(self.sets[0], Box):
             given = [type(each).__name__ for each in self.sets]
             raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
@@ -84,7 +87,7 @@ class Region:
     def eroded(self) -> Self:
         """Return the region whose points, computed in its dtype, lie in this one exactly.
 
-        A dropped set is replaced by one of its family about the centre, whose gauge is finite and
+        A dropped set is replaced by one of its family around the centre, whose gauge is finite and
         has finite gradients; it is masked anyway, but NaN times zero would be NaN.
         """
         magnitude = torch.maximum(self.bounds.low.abs(), self.bounds.high.abs()).amax(-1)
@@ -92,9 +95,9 @@ class Region:
         for stage, each in enumerate(self.sets):
             shrunk = each.eroded(magnitude)
             if self.active is not None and stage > 0:
-                shrunk = shrunk.where(self.active[..., stage], each.unit_about(self.centre))
+                shrunk = shrunk.unless_dropped(self.active[..., stage], self.centre)
             sets.append(shrunk)
-        return type(self)(tuple(sets), self.centre, self.active)
+        return type(self)(tuple(sets), self.centre, self.active, validate_args=False)
 
     @classmethod
     def build(cls, sets: Sequence[ConstraintSet], centre: Tensor | None = None) -> Self:

@@ -62,7 +62,8 @@ class ExactFlow(Flow):
         active: Tensor | None,
     ) -> GaugeSquash:
         assert centre is not None
-        return GaugeSquash(Region((bounds, *sets), centre, active), validate_args=False)
+        region = Region((bounds, *sets), centre, active, validate_args=False)
+        return GaugeSquash(region, validate_args=False)
 
 
 class RadialFlow(Flow):

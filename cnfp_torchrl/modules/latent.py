@@ -9,6 +9,7 @@ action; added to the action it breaks the constraints.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
@@ -18,7 +19,7 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import (
     IndependentNormal,
     SafeProbabilisticModule,
@@ -110,16 +111,15 @@ class LatentScorer(SafeProbabilisticModule):
 
     build_dist_from_params = get_dist
 
+    def named_modules(self, *args: Any, **kwargs: Any) -> Iterator[tuple[str, nn.Module]]:
+        """Leave the flow module out, which is a part and not a distribution of its own.
 
-class LatentActorModule(SafeProbabilisticTensorDictSequential):
-    """An actor that ends in a `LatentScorer`."""
-
-    def build_dist_from_params(self, tensordict: TensorDictBase) -> LatentGaussian:
-        """Return the distribution over latents.
-
-        tensordict's own method takes the innermost probabilistic module: the scorer's flow module.
+        Among an actor's modules, tensordict takes the last probabilistic one for its distribution,
+        and losses count them.
         """
-        return _parts(self)[-1].get_dist(tensordict)
+        for name, module in super().named_modules(*args, **kwargs):
+            if module is not self.head:
+                yield name, module
 
 
 class LatentActor(NamedTuple):
@@ -132,7 +132,7 @@ class LatentActor(NamedTuple):
     """
 
     policy: TensorDictSequential
-    base: LatentActorModule
+    base: SafeProbabilisticTensorDictSequential
 
 
 def split_at_latent(
@@ -176,5 +176,5 @@ def split_at_latent(
     sampler = SafeProbabilisticModule(distribution_class=IndependentNormal, **options)
     return LatentActor(
         policy=TensorDictSequential(*body, sampler, FlowMap(head, latent_key)),
-        base=LatentActorModule(*body, LatentScorer(head, **options)),
+        base=SafeProbabilisticTensorDictSequential(*body, LatentScorer(head, **options)),
     )

@@ -34,7 +34,9 @@ class SafeRandomPolicy(TensorDictModuleBase):
 class WarmUpPolicy(TensorDictModuleBase):
     """Act at random, within the constraints, for a number of frames, then with the actor.
 
-    Takes the place of a collector's ``init_random_frames``, whose actions are not constrained.
+    Takes the place of a collector's ``init_random_frames``, whose actions are not constrained. A
+    collector tries its policy once when it is made, which counts as one action of each batch
+    element; to begin anew, set `frames_left`. Each process of a distributed collector counts alone.
 
     Args:
         actor: a constrained actor.

@@ -323,6 +323,7 @@ def chains() -> tuple[Case, ...]:
             "chain",
             (several.bounds(), several.ellipsoid(), several.ball()),
         ),
+        Case("box-ball-d3-mixed-batch", "chain", (Maker(3, seed=13).bounds(), several.ball())),
         Case("ball-ball-d6", "chain", (many.ball(), many.ball())),
     )
 
@@ -384,6 +385,7 @@ def regions() -> Regions:
     found["huge-ball-d2"] = _huge_ball()
     found["visible-d2-batch"] = _visible()
     found["dropped-d3-batch"] = _dropped()
+    found["mixed-batches-d3"] = _mixed()
     return found
 
 
@@ -418,6 +420,14 @@ def _dropped() -> tuple[tuple[ConstraintSet, ...], Tensor, Tensor]:
     ball = make.ball()
     away = Ball(torch.where(active[:, 1:2], ball.center, ball.center + 100.0), ball.radius)
     return (make.bounds(), away, make.ellipsoid(), make.positive_part()), make.centre, active
+
+
+def _mixed() -> tuple[tuple[ConstraintSet, ...], Tensor, Tensor]:
+    """One centre, and sets and flags whose batch shapes have to be broadcast."""
+    one, rows, columns = Maker(3, seed=37), Maker(3, (4, 1), seed=38), Maker(3, (2,), seed=39)
+    rows.centre = columns.centre = one.centre
+    active = torch.tensor([[True, True, True], [True, False, True]])
+    return (one.bounds(), rows.ball(), columns.half_spaces()), one.centre, active
 
 
 @cache

@@ -13,6 +13,7 @@ from cnfp_torchrl.bijectors import (
     BoxSquash,
     EllipsoidSquash,
     GaugeSquash,
+    RadialSquash,
     Retraction,
     paper_squash,
 )
@@ -123,3 +124,14 @@ def test_checks_can_be_left_out() -> None:
     EllipsoidSquash(ZERO, -torch.eye(2), validate_args=False)
     GaugeSquash(unchecked_region(ONE, -ONE), validate_args=False)
     Retraction(BOX, Ball(ZERO, torch.tensor(0.5)), ZERO)
+
+
+@pytest.mark.parametrize("kind", [GaugeSquash, RadialSquash])
+def test_a_broken_constraint_is_not_ignored(kind: type[GaugeSquash] | type[RadialSquash]) -> None:
+    """Unchecked NaN comes out as NaN, which environments refuse; not as an unconstrained action."""
+    broken = Ball(ZERO, torch.tensor(torch.nan), validate_args=False)
+    bijector = kind(Region((BOX, broken), ZERO))
+    for latent in (torch.tensor([0.3, -0.2]), 1e6 * ONE):
+        action, log_det = bijector.forward_and_log_det(latent)
+        assert action.isnan().all()
+        assert log_det.isnan().all()

@@ -123,6 +123,18 @@ def test_inactive_constraints_are_not_asked(
         guard(acted.set(("constraints", name, "active"), flags))
 
 
+def test_the_one_named_is_active(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
+    # An agent before it breaks another constraint, of lower priority, which is inactive there.
+    set_action(acted, BREAKING["battery"](acted))
+    flags = acted["constraints", "battery", "active"].clone()
+    flags[AGENT] = False
+    acted["constraints", "battery", "active"] = flags
+    acted["action"][AGENT + 1] = BREAKING["obstacle"](acted)
+    message = rf"constraint 'obstacle'.*batch index \[{AGENT + 1}\]"
+    with pytest.raises(ConstraintViolationError, match=message):
+        guard(acted)
+
+
 @pytest.mark.parametrize("index", [(), (1, 2)], ids=["unbatched", "two batch dimensions"])
 def test_the_index_has_the_batch_dimensions(
     guard: ExecutedActionGuard, acted: TensorDictBase, index: tuple[int, ...]
