@@ -31,7 +31,7 @@ def test_every_option_runs(option: str, tmp_path: Path) -> None:
     assert summary["steps"] == 64
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate"])
+@pytest.mark.parametrize("name", ["train", "evaluate", "audit"])
 def test_every_main_configuration_composes(name: str) -> None:
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         assert compose(name)

@@ -64,6 +64,6 @@ def test_a_strangers_configuration_instantiates_nothing_foreign(
 def test_own_packages_can_be_trusted(tmp_path: Path) -> None:
     content = SECTIONS | {"env": {"_target_": "my_package.Env"}}
     OmegaConf.save(content, tmp_path / CONFIG)
-    with pytest.raises(PermissionError, match="my_package.Env"):
+    with pytest.raises(PermissionError, match=r"my_package\.Env"):
         RunFolder(tmp_path).load_config()
     assert RunFolder(tmp_path).load_config(["my_package."]) == content

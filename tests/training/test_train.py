@@ -49,7 +49,8 @@ def test_violations_are_those_the_environment_counts(
 
     monkeypatch.setattr(PointNavEnv, "_step", counting_step)
     _, summary = tiny_run("flow=none")
-    assert summary["violations"] == dict(zip(["obstacle", "battery"], counted.tolist(), strict=True))
+    obstacle, battery = counted.tolist()
+    assert summary["violations"] == {"obstacle": obstacle, "battery": battery}
     assert summary["violations"]["obstacle"] > 0
 
 
@@ -135,5 +136,5 @@ def test_unknown_configuration_is_refused(
 
 
 def test_a_diverged_run_fails_loudly(tiny_run: Run) -> None:
-    with pytest.raises((FloatingPointError, ValueError), match="nan|inf"):
+    with pytest.raises((FloatingPointError, ValueError), match=r"nan|inf"):
         tiny_run("optim.lr=1e30", "training.update_ratio=1")
