@@ -157,9 +157,8 @@ def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor
     A Gaussian's noise is scored where it is drawn: recovering it as (z - loc) / scale would lose it
     to rounding where the scale is small beside the location, and costs more.
     """
-    independent = isinstance(base, Independent) and base.reinterpreted_batch_ndims == 1
-    gaussian = base.base_dist if independent else None
-    if type(gaussian) is not Normal:
+    gaussian = base.base_dist if isinstance(base, Independent) else None
+    if type(gaussian) is not Normal or len(gaussian.batch_shape) != len(base.batch_shape) + 1:
         latent = base.rsample(shape)
         return latent, base.log_prob(latent)
     loc, scale = gaussian.loc, gaussian.scale

@@ -69,7 +69,9 @@ def test_evaluate_prints_a_table_and_writes_it(folder: Path, tmp_path: Path) -> 
 def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
     done = run(tmp_path, "cnfp-train", "-m", "seed=0,1", "flow=exact,squash", *TINY)
     assert done.returncode == 0, done.stderr
-    summaries = [json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")]
+    summaries = [
+        json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")
+    ]
     jobs = {(summary["seed"], summary["flow"]) for summary in summaries}
     assert jobs == {(seed, flow) for seed in (0, 1) for flow in ("ExactFlow", "PaperChain")}
 

@@ -106,7 +106,8 @@ def test_deterministic_actions_are_those_of_the_actor(
 def test_keys_and_options_of_the_actor_are_kept(
     env: TransformedEnv, state: TensorDictBase, make_tanh_actor: Callable[..., Any]
 ) -> None:
-    actor = constrain(make_tanh_actor(num_samples=3), *constraint_bijectors(env))
+    drawn = make_tanh_actor(num_samples=3, default_interaction_type=InteractionType.RANDOM)
+    actor = constrain(drawn, *constraint_bijectors(env))
     policy, base = split_at_latent(actor, latent_key=("inner", "z"), log_prob_key="score")
     with torch.no_grad():
         steps = policy(state.copy())
