@@ -32,7 +32,7 @@ def test_standing_still_has_the_return_and_violations_of_the_table(batch: tuple[
     stations = torch.tensor(env.layout.stations)
     away = (torch.cdist(start[:, :2], stations) > 0.1).all(-1) & (distance > 0.1)
     charge = (start[:, 2] * 100).round()
-    # Step t leaves charge - t percent, which violates below 20, so of 100 steps the first ones do not.
+    # Step t leaves charge - t percent, which violates below 20.
     expected = (100 - (charge - 20)).clamp(0, 100)
     assert away.any()
     torch.testing.assert_close(result.returns[away], -100 * distance[away], rtol=1e-4, atol=0.01)
