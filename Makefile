@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 CONSTRAINTS := .ci/constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate test test-slow check lint types format clean
+.PHONY: help install train evaluate audit test test-slow bench check lint types format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -29,6 +29,12 @@ test: $(STAMP) ## Run the fast tests
 
 test-slow: $(STAMP) ## Run the tests marked slow
 	$(PY) -m pytest -m slow $(ARGS)
+
+bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 minutes)
+	$(PY) experiments/benchmarks/flows.py $(ARGS)
+
+audit: $(STAMP) ## Look for flaws in the constraints' geometry (ARGS="key=value ...")
+	$(PY) experiments/audit.py $(ARGS)
 
 check: lint types ## Check format, lint and types
 
