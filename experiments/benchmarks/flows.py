@@ -72,7 +72,7 @@ class Problem:
             torch.ones(batch, constraints + 1, dtype=torch.bool),
         )
 
-    def base(self) -> Independent:
+    def base(self) -> Independent[Normal]:
         """Return the Gaussian."""
         normal = Normal(self.loc, self.scale, validate_args=False)
         return Independent(normal, 1, validate_args=False)
