@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.bijectors.bijector import Bijector
+from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
 from cnfp_torchrl.bijectors.hyperbolic import log_sech_squared
-from cnfp_torchrl.bijectors.rays import scaled_direction
+from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
 from cnfp_torchrl.geometry import GeometryError, Region
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS
 
@@ -56,6 +56,12 @@ class ShellSquash(Bijector):
                 f"apart, given inner {inner.tolist()}, outer {outer.tolist()}"
             )
         self._region = None if region is None else region.eroded()
+
+    @property
+    def shape(self) -> torch.Size:
+        region = () if self._region is None else (region_shape(self._region)[:-1],)
+        batch = broadcast_shape(self._center.shape[:-1], self._inner.shape, *region)
+        return torch.Size((*batch, self._center.shape[-1]))
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         direction, unit_length, width = self._rays(latent)

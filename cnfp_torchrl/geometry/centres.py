@@ -47,7 +47,8 @@ def lexicographic_centre(
         The centres ``(*batch, d)`` and the active flags, boolean ``(*batch, K + 1)``.
 
     Raises:
-        GeometryError: when ``sets[0]`` is no box, or is unbounded where a search is needed.
+        GeometryError: when ``sets[0]`` is no box; where a search is needed, also when it is
+            unbounded or a field has NaN in it.
     """
     if not sets or not isinstance(sets[0], Box):
         given = [type(each).__name__ for each in sets]
@@ -98,13 +99,17 @@ def chebyshev_centre(
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
 
     Raises:
-        GeometryError: when the first set is no finite box.
+        GeometryError: when the first set is no finite box, or a field has NaN in it.
         RuntimeError: when the search does not come to an end.
     """
     wide = [each.with_fields(lambda field, _: field.double()) for each in sets]
     bounds = wide[0]
     if not isinstance(bounds, Box) or not bool((bounds.high - bounds.low).isfinite().all()):
         raise GeometryError("sets[0]: expected a finite Box of action bounds")
+    for i, each in enumerate(wide):
+        for name, field in each.fields().items():
+            if bool(field.isnan().any()):
+                raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
     if active is None:
         active = bounds.low.new_ones(*bounds.batch_shape, len(sets)).bool()
     start = (bounds.low + bounds.high) / 2
