@@ -52,6 +52,8 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     # Data
     policy = WarmUpPolicy(actor, settings.warmup_frames)
     collector = instantiate(config.collector, _partial_=True)(env, policy)
+    # A collector tries its policy once when it is made, which is not a step of the warm-up.
+    policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
     kept = [*actor.in_keys, "action"]
     kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]

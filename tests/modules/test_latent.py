@@ -229,9 +229,9 @@ def test_the_flow_moves_with_the_loss(
     state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
 ) -> None:
     policy, base = split_at_latent(make_actor())
-    loss = ClipPPOLoss(base, critic).double()
     with torch.no_grad():
         steps = with_advantages(policy(state))
+    loss = ClipPPOLoss(base, critic).double()  # the network is shared: the policy's, too
     losses = loss(steps.apply(lambda t: t.double() if t.is_floating_point() else t))
     assert losses["entropy"].dtype == torch.float64
     assert losses["ESS"].item() == pytest.approx(1, abs=1e-6)
