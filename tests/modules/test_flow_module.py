@@ -110,7 +110,7 @@ def test_each_missing_entry_is_named(
         ("none", BoxSquash),
         (PaperChain(max_radius=0.5), BijectorChain),
     ],
-    ids=str,
+    ids=["exact", "radial", "squash", "none", "object"],
 )
 def test_flows_by_name_and_as_objects(
     make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type

@@ -1,0 +1,97 @@
+"""TD3 on a constrained deterministic actor: all its noise goes into the latent.
+
+    python experiments/examples/td3_latent_noise.py [--steps 8000]
+
+Both of TD3's noises, of exploration and of the smoothed target, are added before the flow, which
+carries them to allowed actions. Added to the action, they would break the constraints.
+"""
+
+import argparse
+import math
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
+from torchrl.objectives import SoftUpdate, TD3Loss
+
+from cnfp_torchrl.envs import (
+    BatteryGeometry,
+    ConstraintCentre,
+    ObstacleGeometry,
+    PointNavEnv,
+    constraint_bijectors,
+)
+from cnfp_torchrl.modules import ConstrainedFlowModule, FlowMap
+
+
+def main() -> None:
+    """Train on point navigation and count violations."""
+    parser = argparse.ArgumentParser(description="TD3 with hard constraints on point navigation.")
+    parser.add_argument("--steps", type=int, default=8000, help="environment steps")
+    parser.add_argument("--agents", type=int, default=16, help="that act in parallel")
+    parser.add_argument("--updates", type=int, default=32, help="for each 8 steps of all agents")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.manual_seed(arguments.seed)
+
+    base_env = PointNavEnv([arguments.agents], seed=arguments.seed)
+    env = TransformedEnv(base_env, Compose(BatteryGeometry(), ObstacleGeometry()))
+    bijectors = constraint_bijectors(env)
+    env.append_transform(ConstraintCentre(bijectors))
+    flow = FlowMap(ConstrainedFlowModule(env.action_spec_unbatched, bijectors))
+    network = TensorDictModule(MLP(5, 2, num_cells=[64, 64]), ["observation"], ["latent"])
+    # The latent starts near N(0, 1) and ends near the network's choice.
+    noise = AdditiveGaussianModule(
+        Unbounded(2), 1.0, 0.1, annealing_num_steps=arguments.steps, action_key="latent"
+    )
+    policy = TensorDictSequential(network, noise, flow)
+
+    # To the loss, the latent is the action, and the flow the first layer of the critic.
+    actor = TensorDictSequential(network, flow)
+    critic = TensorDictSequential(
+        flow, ValueOperator(MLP(7, 1, num_cells=[64, 64]), in_keys=["observation", "action"])
+    )
+    loss = TD3Loss(actor, critic, bounds=(-math.inf, math.inf))
+    loss.set_keys(action="latent")
+    loss.make_value_estimator(gamma=0.99)
+    target = SoftUpdate(loss, tau=0.005)
+    actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), lr=1e-3)
+    critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=1e-3)
+
+    frames = 8 * arguments.agents
+    storage = LazyTensorStorage(arguments.steps + frames)  # the last batch may go beyond the steps
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=128)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=frames,
+        total_frames=arguments.steps,
+        auto_register_policy_transforms=False,
+    )
+    for batch in collector:
+        buffer.extend(batch.reshape(-1))
+        noise.step(batch.numel())
+        for update in range(arguments.updates):
+            sample = buffer.sample()
+            critic_optimizer.zero_grad()
+            loss.value_loss(sample)[0].backward()
+            critic_optimizer.step()
+            if update % 2 == 0:
+                actor_optimizer.zero_grad()
+                loss.actor_loss(sample)[0].backward()
+                actor_optimizer.step()
+                target.step()
+    collector.shutdown()
+
+    steps = buffer[:]
+    reward, last = steps["next", "reward"], -len(steps) // 4
+    print(f"mean reward {reward.mean():.2f}, in the last quarter {reward[last:].mean():.2f}")
+    for name, count in zip(env.constraint_names, steps["next", "cost"].sum(0), strict=True):
+        print(f"{name}: {count:.0f} violations in {len(steps)} steps")
+
+
+if __name__ == "__main__":
+    main()
