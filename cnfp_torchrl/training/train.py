@@ -39,6 +39,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     judgement: EvaluationSettings = instantiate(config.evaluation)
     score = instantiate(config.env.get("score"))
     torch.manual_seed(config.seed)
+    torch.set_num_threads(config.threads)
 
     # Environment and agent
     env = build_environment(config)
