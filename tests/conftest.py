@@ -1,6 +1,10 @@
 """What all tests share: one thread per worker, and the same random numbers for each test."""
 
+import os
 import random
+
+# Read when NumPy is first imported; each worker has one core to itself.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

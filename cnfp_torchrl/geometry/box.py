@@ -57,10 +57,11 @@ class Box(ConstraintSet):
         return type(self)(centre - 1, centre + 1, validate_args=False)
 
     def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
-        # Arithmetic, because torch.where is slow where the mask broadcasts.
-        grown = (~active).to(self.dtype).unsqueeze(-1)
-        low = torch.minimum(self.low, centre - grown)
-        high = torch.maximum(self.high, centre + grown)
+        # Arithmetic, because torch.where is slow where the mask broadcasts. Where the set is active
+        # the shift is so large that the bounds stay, wherever the centre is.
+        shift = active.to(self.dtype).unsqueeze(-1) * (torch.finfo(self.dtype).max / 2) - 1
+        low = torch.minimum(self.low, centre + shift)
+        high = torch.maximum(self.high, centre - shift)
         return type(self)(low, high, validate_args=False)
 
     def superlevel(self) -> Rows:

@@ -1,0 +1,26 @@
+"""Gauges compile without graph breaks, and give the same values."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.geometry.cases import CASES, FAMILIES, Case
+
+
+@pytest.mark.parametrize(
+    "case",
+    [next(c for c in CASES if c.name.startswith(name)) for name in FAMILIES],
+    ids=lambda case: case.name,
+)
+def test_compiled_gauge_is_the_same(case: Case) -> None:
+    way = case.directions(8, torch.float64)
+
+    def gauge(way: Tensor, centre: Tensor, fields: dict[str, Tensor]) -> Tensor:
+        return type(case.sets)(**fields, validate_args=False).eroded().gauge(way, centre)
+
+    torch.compiler.reset()
+    compiled = torch.compile(gauge, fullgraph=True, backend="aot_eager", dynamic=False)
+    arguments = (way, case.inside, case.sets.fields())
+    torch.testing.assert_close(compiled(*arguments), gauge(*arguments), rtol=1e-12, atol=0)
