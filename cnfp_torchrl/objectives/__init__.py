@@ -1,5 +1,6 @@
 """Losses that TorchRL lacks."""
 
 from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
+from cnfp_torchrl.objectives.sac_lagrangian import SACLagrangianLoss
 
-__all__ = ["ConstrainedSACLoss"]
+__all__ = ["ConstrainedSACLoss", "SACLagrangianLoss"]

@@ -1,4 +1,4 @@
-"""Environment, actor and critic of a run, assembled from its configuration."""
+"""Environment, actor, critics and loss of a run, assembled from its configuration."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
 from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import Flow, make_constrained_actor
-from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
+from cnfp_torchrl.training.environment import counted_constraints, make_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 
 
 def build_environment(
-    config: DictConfig, *, batch_size: list[int] | None = None, with_centre: bool = False
+    config: DictConfig,
+    *,
+    batch_size: list[int] | None = None,
+    with_centre: bool = False,
+    with_penalty: bool = False,
 ) -> TransformedEnv:
     """Return the environment of a configuration.
 
@@ -24,6 +30,8 @@ def build_environment(
         config: with sections ``env`` and ``flow``.
         batch_size: replaces the batch size of environments that have one.
         with_centre: publish centre and active flags also where the flow does not need them.
+        with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
+            are judged on the reward without it.
     """
     flow: Flow = instantiate(config.flow.combine)
     replaced: dict[str, Any] = {}
@@ -34,6 +42,7 @@ def build_environment(
         {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
         order=list(config.flow.order),
         with_centre=with_centre or flow.is_exact,
+        penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
     )
 
 
@@ -55,6 +64,36 @@ def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     observation_size = env.observation_spec["observation"].shape[-1]
     action_size = env.action_spec_unbatched.shape[-1]
     return instantiate(config.network.critic, observation_size, action_size)
+
+
+def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
+    """Return the critic of the costs that an environment counts."""
+    observation_size = env.observation_spec["observation"].shape[-1]
+    action_size = env.action_spec_unbatched.shape[-1]
+    constraints = len(counted_constraints(env))
+    return instantiate(config.network.cost_critic, observation_size, action_size, constraints)
+
+
+def build_loss(
+    config: DictConfig, env: TransformedEnv, actor: SafeProbabilisticTensorDictSequential
+) -> ConstrainedSACLoss:
+    """Return the loss of a configuration, with critics of its own for the actor.
+
+    Raises:
+        ValueError: when the loss needs costs and the environment counts none.
+    """
+    make = instantiate(config.loss, _partial_=True)
+    networks: list[TensorDictModule] = [actor, build_critic(config, env)]
+    options: dict[str, Any] = {"action_spec": env.action_spec_unbatched}
+    if isinstance(make.func, type) and issubclass(make.func, SACLagrangianLoss):
+        options["constraint_names"] = counted_constraints(env)
+        if not options["constraint_names"]:
+            raise ValueError(
+                "loss: expected an environment that counts costs, given one without; append a "
+                "ConstraintCost, or take loss=sac"
+            )
+        networks.append(build_cost_critic(config, env))
+    return make(*networks, **options)
 
 
 def load_actor(

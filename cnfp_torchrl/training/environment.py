@@ -9,6 +9,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from cnfp_torchrl.envs import (
     ConstraintCentre,
     GeometryTransform,
+    RewardPenalty,
     constraint_bijectors,
     constraint_names,
 )
@@ -20,6 +21,7 @@ def make_environment(
     *,
     order: Sequence[str],
     with_centre: bool,
+    penalty: RewardPenalty | None = None,
 ) -> TransformedEnv:
     """Return the environment whose states carry the constraints' geometry.
 
@@ -28,6 +30,7 @@ def make_environment(
         geometries: one transform for each constraint, by its name.
         order: the constraints' names in order of application.
         with_centre: also publish centre and active flags, which exact flows need.
+        penalty: what violations cost; ``episode_reward`` sums the reward without it.
 
     Raises:
         ValueError: when a geometry publishes under another name than its own, or the order does not
@@ -39,6 +42,8 @@ def make_environment(
                 f"env.geometry.{name}.name: expected '{name}', given '{geometry.name}'"
             )
     env = TransformedEnv(base, Compose(*geometries.values(), RewardSum()))
+    if penalty is not None:
+        env.append_transform(penalty)
     if with_centre:
         env.append_transform(ConstraintCentre(constraint_bijectors(env), order))
     return env

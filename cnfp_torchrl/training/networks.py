@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 
@@ -59,3 +60,27 @@ def action_value_network(
         activation_class=nn.ReLU,
     )
     return ValueOperator(_ActionValue(network), in_keys=["observation", "action"])
+
+
+def action_cost_network(
+    observation_size: int,
+    action_size: int,
+    constraints: int,
+    *,
+    hidden: Sequence[int] = (256, 256),
+) -> TensorDictModule:
+    """Return a critic of ``observation`` and ``action`` that writes ``state_action_cost``.
+
+    Args:
+        observation_size: number of observed numbers.
+        action_size: d.
+        constraints: K, the number of outputs.
+        hidden: widths of the hidden layers.
+    """
+    network = MLP(
+        in_features=observation_size + action_size,
+        out_features=constraints,
+        num_cells=list(hidden),
+        activation_class=nn.ReLU,
+    )
+    return TensorDictModule(network, ["observation", "action"], ["state_action_cost"])

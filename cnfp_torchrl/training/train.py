@@ -16,7 +16,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
-from cnfp_torchrl.training.agent import build_actor, build_critic, build_environment
+from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, evaluate
 from cnfp_torchrl.training.metrics import Metrics
@@ -42,11 +42,10 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     torch.set_num_threads(config.threads)
 
     # Environment and agent
-    env = build_environment(config)
+    env = build_environment(config, with_penalty=True)
     env.set_seed(config.seed)
     actor = build_actor(config, env)
-    make_loss = instantiate(config.loss, _partial_=True)
-    loss = make_loss(actor, build_critic(config, env), action_spec=env.action_spec_unbatched)
+    loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
 
@@ -58,6 +57,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     buffer = instantiate(config.replay_buffer)
     kept = [*actor.in_keys, "action"]
     kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
+    kept += [key for key in [("next", "cost")] if key in loss.in_keys]
 
     folder.save_config(config)
     metrics = Metrics(

@@ -1,0 +1,279 @@
+"""Soft actor-critic with a Lagrangian: constraints in expectation, beside hard ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import SACLoss
+from torchrl.objectives.utils import _vmap_func, distance_loss
+
+from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
+
+_REFUSED = ("value_network", "skip_done_states")
+"""Options of SACLoss that the cost critic does not follow."""
+
+
+class SACLagrangianLoss(ConstrainedSACLoss):
+    r"""SAC whose actor pays for expected costs, with one learned price for each constraint.
+
+    A cost critic :math:`Q_c(s, a) \in \mathbb{R}^K` estimates the discounted sum of each
+    constraint's costs under the policy, and multipliers :math:`\lambda_k = \exp(l_k)` weigh them:
+
+    .. math::
+        L_\pi &= E[\alpha \log\pi(a|s) - \min_i Q_i(s, a) + \sum_k \lambda_k Q_{c,k}(s, a)] \\
+        L_{Q_c} &= E[\textstyle\sum_k \ell(Q_{c,k}(s, a),\;
+            c_k + \gamma_c (1 - \text{terminated}) \bar Q_{c,k}(s', a'))], \quad a' \sim \pi(s') \\
+        L_\lambda &= -\sum_k \lambda_k (E[Q_{c,k}(s, a)] - \epsilon_k), \quad
+            0 < \lambda_k \le \lambda_{max}
+
+    with :math:`a \sim \pi(s)` in :math:`L_\pi` and :math:`L_\lambda`: a descent on
+    :math:`L_\lambda` is the dual ascent on :math:`\lambda_k (E[Q_{c,k}] - \epsilon_k)`. Costs are
+    not negative, so with :math:`\epsilon_k = 0` a multiplier can only rise: the bound ends that, or
+    a small :math:`\epsilon_k > 0`. With several cost networks the largest cost counts. Nothing here
+    is guaranteed: constraints hold in expectation, once the critic is right.
+
+    Sources: Ha et al. 2020, "Learning to Walk in the Real World with Minimal Human Effort"
+    (arXiv 2002.08550); Yang et al. 2021, "WCSAC: Worst-Case Soft Actor Critic for
+    Safety-Constrained Reinforcement Learning".
+
+    Reads ``cost`` under ``next``, float32 ``(*batch, K)``, besides what SAC reads. Writes
+    ``loss_cost`` and ``loss_lagrange`` besides SAC's losses, and for the log ``lambda_NAME`` and
+    ``cost_value_NAME``, the multiplier and :math:`E[Q_{c,k}]` of each constraint.
+
+    Args:
+        actor_network: as for `ConstrainedSACLoss`.
+        qvalue_network: as for `ConstrainedSACLoss`.
+        cost_network: reads observation and action, writes ``state_action_cost`` ``(*batch, K)``.
+        thresholds: :math:`\epsilon_k \ge 0`, one for each constraint, in discounted costs: a
+            violation in every step is worth 1 / (1 - gamma_cost).
+        constraint_names: of the columns of ``cost``, for the log; None numbers them.
+        gamma_cost: discount of costs, in [0, 1).
+        lambda_init: where all multipliers start, in (0, lambda_max].
+        lambda_max: their bound, > 0.
+        num_cost_nets: how many cost networks of the same form, with weights of their own.
+        kwargs: passed on to `ConstrainedSACLoss`.
+
+    Raises:
+        ValueError: for a bad argument, naming it, and in ``forward`` for costs of another shape
+            than the thresholds'.
+    """
+
+    @dataclass
+    class _AcceptedKeys(SACLoss._AcceptedKeys):
+        cost: NestedKey = "cost"
+        state_action_cost: NestedKey = "state_action_cost"
+
+    default_keys = _AcceptedKeys
+
+    cost_network: TensorDictModule
+    cost_network_params: TensorDictParams
+    target_cost_network_params: TensorDictParams
+    _in_keys: list[NestedKey]
+    thresholds: Tensor
+
+    def __init__(
+        self,
+        actor_network: SafeProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule,
+        cost_network: TensorDictModule,
+        *,
+        thresholds: Sequence[float],
+        constraint_names: Sequence[str] | None = None,
+        gamma_cost: float = 0.99,
+        lambda_init: float = 1.0,
+        lambda_max: float = 100.0,
+        num_cost_nets: int = 1,
+        **kwargs: Any,
+    ) -> None:
+        limits = [float(each) for each in thresholds]
+        if constraint_names is None:
+            constraint_names = [str(each) for each in range(len(limits))]
+        names = list(constraint_names)
+        _require(
+            len(limits) == len(names) > 0,
+            "thresholds",
+            f"one number for each of the constraints {names}",
+            limits,
+        )
+        _require(all(0 <= each < math.inf for each in limits), "thresholds", "numbers >= 0", limits)
+        _require(0 <= gamma_cost < 1, "gamma_cost", "a discount in [0, 1)", gamma_cost)
+        _require(0 < lambda_max < math.inf, "lambda_max", "a number > 0", lambda_max)
+        _require(
+            0 < lambda_init <= lambda_max,
+            "lambda_init",
+            f"a number in (0, lambda_max = {lambda_max}]",
+            lambda_init,
+        )
+        _require(num_cost_nets >= 1, "num_cost_nets", "a number >= 1", num_cost_nets)
+        for name in _REFUSED:
+            _require(
+                not kwargs.get(name), name, "it left out, it is not supported", kwargs.get(name)
+            )
+        reduction = kwargs.get("reduction")
+        _require(reduction in (None, "mean", "sum"), "reduction", "'mean' or 'sum'", reduction)
+
+        super().__init__(actor_network, qvalue_network, **kwargs)
+        self.convert_to_functional(
+            cost_network, "cost_network", num_cost_nets, create_target_params=True
+        )
+        device = next(self.parameters()).device
+        self.register_buffer("thresholds", torch.tensor(limits, device=device))
+        start = torch.full((len(limits),), math.log(lambda_init), device=device)
+        self.log_lagrange = nn.Parameter(start)
+        self.gamma_cost = gamma_cost
+        self.lambda_max = lambda_max
+        self.constraint_names = tuple(names)
+        self._make_vmap()
+        self._set_in_keys()
+        logged = [f"{kind}_{name}" for kind in ("lambda", "cost_value") for name in names]
+        self._out_keys = [*self.out_keys, "loss_cost", "loss_lagrange", *logged]
+
+    @property
+    def multipliers(self) -> Tensor:
+        """The multipliers ``(K,)``, detached and at most ``lambda_max``."""
+        self._bound()
+        return self.log_lagrange.detach().exp().clamp(max=self.lambda_max)
+
+    def _bound(self) -> None:
+        # In place, as SACLoss bounds its temperature: clamping the output instead would leave the
+        # parameter to run away behind the bound, from where it would not come back in time.
+        self.log_lagrange.data.clamp_(max=math.log(self.lambda_max))
+
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        if "cost_network" not in self.__dict__:  # SACLoss calls this before the network is here
+            return
+        self._vmap_cost_network = _vmap_func(
+            self.cost_network,
+            (None, 0),
+            randomness=self.vmap_randomness,
+            pseudo_vmap=self.deactivate_vmap,
+        )
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        if "cost_network" not in self.__dict__:  # as above
+            return
+        cost = ("next", self.tensor_keys.cost)
+        self._in_keys = list({*self._in_keys, cost, *self.cost_network.in_keys})
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return SAC's losses and the two of the Lagrangian, as scalars."""
+        loss_qvalue, qvalue_metadata = self.qvalue_v2_loss(tensordict)
+        loss_cost = self.cost_loss(tensordict)
+        loss_actor, metadata = self.actor_loss(tensordict)
+        loss_alpha = self._reduce_loss(
+            self._alpha_loss(log_prob=metadata["log_prob"]),
+            tensordict=tensordict,
+            weights=self._maybe_get_priority_weight(tensordict),
+        )
+        tensordict.set(self.tensor_keys.priority, qvalue_metadata["td_error"])
+        expected_cost = metadata["cost_value"].flatten(0, -2).mean(0)
+        losses = {
+            "loss_actor": loss_actor,
+            "loss_qvalue": loss_qvalue,
+            "loss_alpha": loss_alpha,
+            "loss_cost": loss_cost,
+            "loss_lagrange": self.lagrange_loss(expected_cost),
+            "alpha": self._alpha,
+            "entropy": -metadata["log_prob"].mean(),
+        }
+        multipliers = self.multipliers
+        for k, name in enumerate(self.constraint_names):
+            losses[f"lambda_{name}"] = multipliers[k]
+            losses[f"cost_value_{name}"] = expected_cost[k]
+        return TensorDict(losses, batch_size=[])
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the actor's loss, and ``log_prob`` and ``cost_value`` of the drawn actions."""
+        action, log_prob = self._draw(tensordict)
+        value = self._vmap_qnetworkN0(
+            self._inputs(tensordict, self.qvalue_network, action),
+            self._cached_detached_qvalue_params,
+        ).get(self.tensor_keys.state_action_value)
+        cost = self._cost(tensordict, action, self.cost_network_params.detach()).amax(0)
+        price = (self.multipliers * cost).sum(-1)
+        loss = self._reduce_loss(
+            self._alpha * log_prob - value.amin(0).squeeze(-1) + price,
+            tensordict=tensordict,
+            weights=self._maybe_get_priority_weight(tensordict),
+        )
+        return loss, {"log_prob": log_prob.detach(), "cost_value": cost.detach()}
+
+    def cost_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the cost critic's loss, summed over constraints and networks."""
+        action = tensordict.get(self.tensor_keys.action)
+        predicted = self._cost(tensordict, action, self.cost_network_params)
+        target = self._cost_target(tensordict).expand_as(predicted)
+        loss = distance_loss(predicted, target, loss_function=self.loss_function)
+        return self._reduce_loss(
+            loss.sum(-1).sum(0),
+            tensordict=tensordict,
+            weights=self._maybe_get_priority_weight(tensordict),
+        )
+
+    def lagrange_loss(self, expected_cost: Tensor) -> Tensor:
+        """Return the multipliers' loss.
+
+        Args:
+            expected_cost: of each constraint under the policy, ``(K,)``.
+        """
+        self._bound()
+        return -(self.log_lagrange.exp() * (expected_cost.detach() - self.thresholds)).sum()
+
+    @torch.no_grad()
+    def _cost_target(self, tensordict: TensorDictBase) -> Tensor:
+        outcome = tensordict.get("next")
+        cost = outcome.get(self.tensor_keys.cost)
+        expected = (*tensordict.shape, len(self.constraint_names))
+        if cost.shape != expected:
+            raise ValueError(
+                f"key ('next', {self.tensor_keys.cost!r}): expected a cost for each of the "
+                f"constraints {list(self.constraint_names)}, shape {tuple(expected)}, given "
+                f"{tuple(cost.shape)}"
+            )
+        action, _ = self._draw(outcome)
+        after = self._cost(outcome, action, self.target_cost_network_params).amax(0)
+        goes_on = ~outcome.get(self.tensor_keys.terminated)
+        return cost + self.gamma_cost * goes_on * after
+
+    def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            return rsample_and_log_prob(self.actor_network.get_dist(tensordict))
+
+    def _inputs(
+        self, tensordict: TensorDictBase, network: TensorDictModule, action: Tensor
+    ) -> TensorDictBase:
+        selected = tensordict.select(*network.in_keys, strict=False)
+        return selected.set(self.tensor_keys.action, action)
+
+    def _cost(self, tensordict: TensorDictBase, action: Tensor, params: TensorDictParams) -> Tensor:
+        """Return the cost values of actions, ``(num_cost_nets, *batch, K)``."""
+        inputs = self._inputs(tensordict, self.cost_network, action)
+        cost = self._vmap_cost_network(inputs, params).get(self.tensor_keys.state_action_cost)
+        if cost.shape[-1] != len(self.constraint_names):
+            raise ValueError(
+                f"cost_network: expected an output for each of the constraints "
+                f"{list(self.constraint_names)}, given {cost.shape[-1]}"
+            )
+        return cost
+
+
+def _require(good: bool, name: str, expected: str, given: object) -> None:
+    if not good:
+        raise ValueError(f"{name}: expected {expected}, given {given!r}")
