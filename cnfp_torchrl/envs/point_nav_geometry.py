@@ -22,6 +22,8 @@ rectangles.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -38,7 +40,33 @@ _BEYOND = 2.0
 """Sets for states in which no action keeps the constraint begin here, outside the bounds of 1."""
 
 
-class ObstacleGeometry(GeometryTransform):
+class PointNavGeometry(GeometryTransform):
+    """A constraint of point navigation: reads position and charge, knows the map.
+
+    Args:
+        layout: the map; None takes the reference task.
+        name: the constraint's name; None takes the usual one.
+        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
+    """
+
+    usual_name: ClassVar[str]
+
+    def __init__(
+        self,
+        layout: Layout | None = None,
+        name: str | None = None,
+        observation_key: str = "observation",
+    ) -> None:
+        super().__init__(self.usual_name if name is None else name, [observation_key])
+        self.path = ShortestPath(layout)
+        self.layout = self.path.layout
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return `read_observation` of the states."""
+        return read_observation(tensordict, self.in_keys[0])
+
+
+class ObstacleGeometry(PointNavGeometry):
     """A box of moves that touch no obstacle and keep the way to the nearest station open.
 
     For each rectangle the box keeps to the outer side of one of its four edges, prolonged: of those
@@ -48,26 +76,13 @@ class ObstacleGeometry(GeometryTransform):
 
     Where no move keeps the constraint (the agent touches a rectangle, or is out of reach of the
     arena) the box lies beyond the action bounds, in [2, 3] on the axis of the shortest way out.
-
-    Args:
-        layout: the map; None takes the reference task.
-        name: the constraint's name.
-        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
     """
 
-    def __init__(
-        self,
-        layout: Layout | None = None,
-        name: str = "obstacle",
-        observation_key: str = "observation",
-    ) -> None:
-        super().__init__(name, [observation_key])
-        self.path = ShortestPath(layout)
-        self.layout = self.path.layout
+    usual_name = "obstacle"
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
-        position, _ = read_observation(tensordict, self.in_keys[0])
+        position, _ = self.read(tensordict)
         distance = side_distances(position, self.path.rectangles)
         separates = self.path.to_station(position).separates
         eligible = separates | ~separates.any(-1, keepdim=True)
@@ -91,7 +106,7 @@ class ObstacleGeometry(GeometryTransform):
         )
 
 
-class BatteryGeometry(GeometryTransform):
+class BatteryGeometry(PointNavGeometry):
     r"""The ball around the next waypoint of what the battery still reaches after this step.
 
     Its radius is :math:`reach(n) - rest`, see the module, with what remains beyond the waypoint;
@@ -103,26 +118,13 @@ class BatteryGeometry(GeometryTransform):
     Where no move keeps the constraint (the charge is at the threshold or below) the ball lies
     beyond the action bounds, in the direction of the waypoint. Where the station is out of reach it
     is published all the same, and misses the bounds by itself.
-
-    Args:
-        layout: the map; None takes the reference task.
-        name: the constraint's name.
-        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
     """
 
-    def __init__(
-        self,
-        layout: Layout | None = None,
-        name: str = "battery",
-        observation_key: str = "observation",
-    ) -> None:
-        super().__init__(name, [observation_key])
-        self.path = ShortestPath(layout)
-        self.layout = self.path.layout
+    usual_name = "battery"
 
     def constraint_set(self, tensordict: TensorDictBase) -> Ball:
         """Return the ball of allowed moves (docs/method.md, section 4)."""
-        position, battery = read_observation(tensordict, self.in_keys[0])
+        position, battery = self.read(tensordict)
         way = self.path.to_station(position)
         steps_left = battery - 1 - self.layout.battery_threshold
         reach = CAUTIOUS * (self.layout.zone_radius + self.layout.step_length * steps_left)

@@ -12,35 +12,30 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.layout import Layout
-from cnfp_torchrl.envs.point_nav_geometry import ObstacleGeometry, read_observation
+from cnfp_torchrl.envs.point_nav_geometry import ObstacleGeometry, PointNavGeometry
 from cnfp_torchrl.envs.shortest_path import MARGIN
 from cnfp_torchrl.geometry import VisibleOrBox, VisibleRegion
 
 
-class VisibleObstacleGeometry(GeometryTransform):
+class VisibleObstacleGeometry(PointNavGeometry):
     """All moves whose straight way touches no obstacle: not convex, and less timid than a box.
 
     Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
     it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it
     may leave out the zero action and so leads away.
-
-    Args:
-        layout: the map; None takes the reference task.
-        name: the constraint's name.
-        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
     """
+
+    usual_name = "obstacle"
 
     def __init__(
         self,
         layout: Layout | None = None,
-        name: str = "obstacle",
+        name: str | None = None,
         observation_key: str = "observation",
     ) -> None:
-        super().__init__(name, [observation_key])
+        super().__init__(layout, name, observation_key)
         self._box = ObstacleGeometry(layout, name, observation_key)
-        self.layout = self._box.layout
         wall = torch.full((2,), self.layout.wall - MARGIN)
         corners = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
         grown = corners + MARGIN * torch.tensor([[-1.0], [1.0]])
@@ -48,7 +43,7 @@ class VisibleObstacleGeometry(GeometryTransform):
 
     def constraint_set(self, tensordict: TensorDictBase) -> VisibleOrBox:
         """Return the moves in sight, or the box (docs/method.md, section 4)."""
-        position, _ = read_observation(tensordict, self.in_keys[0])
+        position, _ = self.read(tensordict)
         obstacles = self._obstacles.expand(*position.shape[:-1], *self._obstacles.shape)
         step = torch.full_like(position[..., 0], self.layout.step_length)
         region = VisibleRegion(position, obstacles, step, validate_args=False)
