@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -101,15 +102,16 @@ def radial_full_jacobian(p: Problem) -> Sample:
     """Return a sample of a radial squash, its determinant by automatic differentiation."""
     base, region = p.base(), p.region()
 
-    def one(latent: Tensor, index: Tensor) -> Tensor:
-        balls = [Ball(m[index], r[index], validate_args=False) for m, r in p.balls]
-        boxes = [Box(a[index], b[index], validate_args=False) for a, b in p.boxes]
+    count = len(p.balls)
+
+    def one(latent: Tensor, centre: Tensor, *fields: tuple[Tensor, Tensor]) -> Tensor:
+        balls = [Ball(*each, validate_args=False) for each in fields[:count]]
+        boxes = [Box(*each, validate_args=False) for each in fields[count:]]
         sets = (region.bounds, *balls, *boxes)
-        return RadialSquash(Region(sets, p.centre[index], validate_args=False))(latent)
+        return RadialSquash(Region(sets, centre, validate_args=False))(latent)
 
     latent = base.rsample()
-    index = torch.arange(len(latent))
-    jacobian = vmap(jacrev(one))(latent, index)
+    jacobian = vmap(jacrev(one))(latent, p.centre, *p.balls, *p.boxes)
     log_det = torch.linalg.slogdet(jacobian)[1]
     return RadialSquash(region)(latent), base.log_prob(latent) - log_det
 
@@ -171,12 +173,12 @@ def measure(batch: int, dim: int, constraints: int, *, quick: bool) -> dict[str,
         "exact": lambda: exact(p),
         "Dykstra, 50 rounds": lambda: dykstra(p),
     }
+    if batch * dim <= 4096:
+        calls["radial, full Jacobian"] = lambda: radial_full_jacobian(p)
     if not quick:
         compiled, compiled_tanh = torch.compile(exact), torch.compile(tanh_normal)
         calls["exact, compiled"] = lambda: compiled(p)
         calls["TanhNormal, compiled"] = lambda: compiled_tanh(p)
-        if batch * dim <= 4096:
-            calls["radial, full Jacobian"] = lambda: radial_full_jacobian(p)
         if find_spec("cvxpylayers") and batch <= 256:
             calls["cvxpylayers"] = cvxpy_projection(p)
     seconds = 0.02 if quick else 0.5
@@ -215,13 +217,16 @@ def main() -> None:
     """Measure and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="one small problem, for a test")
+    parser.add_argument("--batches", type=int, nargs="+", default=[256, 4096])
+    parser.add_argument("--dims", type=int, nargs="+", default=[2, 6, 32])
+    parser.add_argument("--constraints", type=int, nargs="+", default=[1, 2, 8])
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of flows.json and .md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    batches, dims, counts = (
-        ((8,), (2,), (2,)) if arguments.quick else ((256, 4096), (2, 6, 32), (1, 2, 8))
-    )
+    batches, dims, counts = arguments.batches, arguments.dims, arguments.constraints
+    if arguments.quick:
+        batches, dims, counts = [8], [2], [2]
     rows = []
     for batch in batches:
         for dim in dims:
@@ -239,7 +244,9 @@ def main() -> None:
         [
             "# Time of sampling and scoring, as a ratio to TanhNormal",
             "",
-            f"`python experiments/benchmarks/flows.py`, one thread, {about}.",
+            f"`python experiments/benchmarks/flows.py {' '.join(sys.argv[1:])}".rstrip() + "`",
+            "",
+            f"One thread, {about}.",
             "",
             "Compiled flows are compared with the compiled TanhNormal.",
             "",
