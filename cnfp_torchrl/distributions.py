@@ -11,7 +11,7 @@ from torch.distributions import Distribution, Independent, Normal, TransformedDi
 from torch.distributions.utils import _standard_normal
 
 from cnfp_torchrl.bijectors import Bijector, Stages
-from cnfp_torchrl.bijectors.bijector import broadcast_shape
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
@@ -43,8 +43,13 @@ class ConstrainedFlow(TransformedDistribution):
                 f"{type(base).__name__} with event_shape {tuple(base.event_shape)}; wrap it in "
                 "torch.distributions.Independent(base, 1)"
             )
-        super().__init__(_expanded(base, bijector), bijector, validate_args=False)
+        # What TransformedDistribution.__init__ would find out about any list of transforms.
         self.bijector = bijector
+        self.base_dist = _expanded(base, bijector)
+        self.transforms = [bijector]
+        Distribution.__init__(
+            self, self.base_dist.batch_shape, self.base_dist.event_shape, validate_args=False
+        )
 
     def expand(
         self, batch_shape: Shape, _instance: ConstrainedFlow | None = None
@@ -163,5 +168,6 @@ def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor
         return latent, base.log_prob(latent)
     loc, scale = gaussian.loc, gaussian.scale
     noise = _standard_normal((*shape, *loc.shape), dtype=loc.dtype, device=loc.device)
-    log_prob = -(0.5 * noise.square()).sum(-1) - scale.log().sum(-1)
-    return loc + scale * noise, log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]
+    surprise = torch.addcmul(scale.log(), noise, noise, value=0.5).sum(-1)
+    constant = -0.5 * math.log(2 * math.pi) * loc.shape[-1]
+    return torch.addcmul(loc, scale, noise), constant - surprise

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
+from cnfp_torchrl.bijectors.bijector import Bijector
 from cnfp_torchrl.bijectors.hyperbolic import atanhc, radial_log_det, tanhc
 from cnfp_torchrl.geometry import Ball, GeometryError
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 def squash_to_unit_ball(latent: Tensor) -> tuple[Tensor, Tensor]:

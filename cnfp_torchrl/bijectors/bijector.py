@@ -101,14 +101,6 @@ class Bijector(Transform):
         return self.forward_and_log_det(x)[1]
 
 
-def broadcast_shape(*shapes: torch.Size) -> torch.Size:
-    """Return the shape that shapes broadcast to, at once where they are equal or empty."""
-    known = [shape for shape in shapes if len(shape)]
-    if all(shape == known[0] for shape in known):
-        return known[0] if known else torch.Size()
-    return torch.broadcast_shapes(*known)
-
-
 def log_det_zero(value: Tensor) -> Tensor:
     """Return the log-determinant of the identity at a value, zeros ``(*batch,)``."""
     return torch.zeros_like(value[..., 0])

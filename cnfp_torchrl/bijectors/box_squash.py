@@ -31,7 +31,7 @@ class BoxSquash(Bijector):
 
     def __init__(self, low: Tensor, high: Tensor, *, validate_args: bool = True) -> None:
         box = Box(low, high, validate_args=validate_args)
-        self._set_image(box.eroded(), validate_args)
+        self._set_image(box.eroded(box.magnitude()), validate_args)
 
     @classmethod
     def onto(cls, image: Box, *, validate_args: bool = True) -> Self:
@@ -56,6 +56,8 @@ class BoxSquash(Bijector):
             )
         self._middle = (image.low + image.high) / 2
         self._half = (image.high - image.low) / 2
+        # The largest log-determinant, at a latent of zero.
+        self._peak = self._half.log().sum(-1)
 
     @property
     def shape(self) -> torch.Size:
@@ -68,12 +70,12 @@ class BoxSquash(Bijector):
         return Box(low, high, validate_args=False)
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        action = self._middle + self._half * latent.tanh()
-        return action, self._half.log().sum(-1) + sum_of_log_sech_squared(latent)
+        action = torch.addcmul(self._middle, self._half, latent.tanh())
+        return action, self._peak + sum_of_log_sech_squared(latent)
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         latent = ((action - self._middle) / self._half).atanh()
-        return latent, -(self._half.log().sum(-1) + sum_of_log_sech_squared(latent))
+        return latent, -(self._peak + sum_of_log_sech_squared(latent))
 
     def contains(self, action: Tensor) -> Tensor:
         return (((action - self._middle) / self._half).abs() < 1).all(-1)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors.bijector import Bijector, Stages, broadcast_shape, log_det_zero
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 class BijectorChain(Bijector):

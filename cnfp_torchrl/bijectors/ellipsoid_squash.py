@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.ball_squash import squash_to_unit_ball, unsquash_from_unit_ball
-from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
+from cnfp_torchrl.bijectors.bijector import Bijector
 from cnfp_torchrl.geometry import Ellipsoid, GeometryError
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 class EllipsoidSquash(Bijector):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.box_squash import BoxSquash
-from cnfp_torchrl.bijectors.rays import region_shape, scale_about, scaled_direction, share_of
+from cnfp_torchrl.bijectors.rays import Rays, region_shape
 from cnfp_torchrl.geometry import Region
 
 
@@ -40,7 +42,8 @@ class GaugeSquash(Bijector):
         # 1 + e at the bounds would let the last stage overshoot by e times the distance to the
         # centre, and near a bound one rounding error is a large e.
         sets = (self._box.image, *eroded.sets[1:])
-        self.region = Region(sets, region.centre, region.active, validate_args=False)
+        self.region = Region(sets, region.centre, validate_args=False)
+        self._outer, *self._inner = (each.gauge_about(region.centre) for each in sets)
 
     @property
     def shape(self) -> torch.Size:
@@ -48,34 +51,51 @@ class GaugeSquash(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         bounded, log_det = self._box.forward_and_log_det(latent)
-        share = self._share(bounded - self.region.centre)
-        action = scale_about(self.region.centre, bounded, share)
-        return action, log_det + latent.shape[-1] * share.log()
+        action, share = self._retract(bounded)
+        return action, torch.add(log_det, share.log(), alpha=latent.shape[-1])
 
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         bounded, log_det = self._box.forward_and_log_det(latent)
-        share = self._share(bounded - self.region.centre)
-        return scale_about(self.region.centre, bounded, share), log_det
+        return self._retract(bounded)[0], log_det
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        share = self._share(action - self.region.centre)
-        bounded = scale_about(self.region.centre, action, 1 / share)
+        bounded, share = self._expand(action)
         latent, log_det = self._box.inverse_and_log_det(bounded)
         return latent, log_det - latent.shape[-1] * share.log()
 
     def contains(self, action: Tensor) -> Tensor:
-        share = self._share(action - self.region.centre)
-        return self._box.contains(scale_about(self.region.centre, action, 1 / share))
+        return self._box.contains(self._expand(action)[0])
 
     def stages(self, latent: Tensor) -> Stages:
         bounded, log_det = self._box.forward_and_log_det(latent)
-        direction, zero = scaled_direction(bounded - self.region.centre)
-        gauges = self.region.gauges(direction)
-        shares = share_of(gauges[0], gauges, zero)
-        actions = scale_about(self.region.centre, bounded, shares)
-        return Stages(actions, log_det + latent.shape[-1] * shares.log())
+        offset = bounded - self.region.centre
+        shares = self._shares(offset)
+        actions = torch.addcmul(self.region.centre, offset, shares.unsqueeze(-1))
+        return Stages(actions, torch.add(log_det, shares.log(), alpha=latent.shape[-1]))
+
+    def _retract(self, bounded: Tensor) -> tuple[Tensor, Tensor]:
+        offset = bounded - self.region.centre
+        share = self._share(offset)
+        return torch.addcmul(self.region.centre, offset, share.unsqueeze(-1)), share
+
+    def _expand(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        offset = action - self.region.centre
+        share = self._share(offset)
+        return self.region.centre + offset / share.unsqueeze(-1), share
 
     def _share(self, offset: Tensor) -> Tensor:
-        direction, zero = scaled_direction(offset)
-        outer, inner = self.region.outer_and_inner_gauge(direction)
-        return share_of(outer, inner, zero)
+        rays = Rays(offset, self._outer)
+        if not self._inner:
+            return torch.ones_like(rays.progress)
+        gauges = [gauge(rays.direction) for gauge in self._inner]
+        if len(gauges) > 1:
+            # Not one maximum after the other: the gradient of each costs as much as of all at once.
+            gauges = [torch.stack(torch.broadcast_tensors(*gauges)).amax(0)]
+        return rays.share(gauges[0])
+
+    def _shares(self, offset: Tensor) -> Tensor:
+        """Return the share after each stage, ``(K + 1, *batch)``."""
+        rays = Rays(offset, self._outer)
+        gauges = (gauge(rays.direction) for gauge in self._inner)
+        running = [rays.share(gauge) for gauge in accumulate(gauges, torch.maximum)]
+        return torch.stack(torch.broadcast_tensors(torch.ones_like(rays.progress), *running))

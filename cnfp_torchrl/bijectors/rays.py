@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors.bijector import broadcast_shape
-from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.geometry.constraint_set import Gauge
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,29 +37,45 @@ def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
 def region_shape(region: Region) -> torch.Size:
     """Return the shape ``(*batch, d)`` of a region's actions."""
     active = () if region.active is None else (region.active.shape[:-1],)
-    batch = broadcast_shape(region.centre.shape[:-1], *active, *map(set_batch_shape, region.sets))
+    sets = (each.batch_shape for each in region.sets)
+    batch = broadcast_shape(region.centre.shape[:-1], *active, *sets)
     return torch.Size((*batch, region.centre.shape[-1]))
 
 
-def set_batch_shape(each: ConstraintSet) -> torch.Size:
-    """Return a set's batch shape, faster than `ConstraintSet.batch_shape` where fields agree."""
-    fields = ((getattr(each, name).shape, dims) for name, dims in each.event_dims.items())
-    return broadcast_shape(*(shape[: len(shape) - dims] for shape, dims in fields))
+class Rays:
+    """The rays from a centre through points of an outer set.
 
+    `progress` is the share of the way to the outer boundary at which a point lies, the outer gauge
+    of its offset, and `direction` its ray, ``(*batch, d)``.
 
-def share_of(outer: Tensor, inner: Tensor, zero: Tensor) -> Tensor:
-    """Return the share ``outer / inner`` of a ray that remains, from the gauges of its direction.
-
-    Where the inner gauge is the outer one, the share is 1 with a gradient of 0, and not with the
-    difference of two equal terms, which would be rounding error over the ray's length. A gauge that
-    is NaN makes the share NaN: a broken constraint must not pass for one that does not bind.
+    Args:
+        offset: points minus the centre, ``(*batch, d)``.
+        outer: the outer set's gauge about the centre.
     """
-    return torch.where(zero | (inner == outer), 1.0, outer / inner)
 
+    def __init__(self, offset: Tensor, outer: Gauge) -> None:
+        # In one dimension a direction is a sign and has no gradient; computed, its exact zero would
+        # be rounding error over the length.
+        offset = offset.detach() if offset.shape[-1] == 1 else offset
+        self.progress = outer(offset)
+        # An offset of zero has no direction, and one so short that gradients, which grow like
+        # 1/length, could overflow when squared, has none to speak of. It is given one, so that
+        # nothing becomes NaN. Arithmetic, because torch.where is slow where the mask broadcasts.
+        zero = self.progress < torch.finfo(offset.dtype).tiny ** 0.4
+        self.direction = offset + zero.to(offset.dtype).unsqueeze(-1)
+        self._outer = self.progress.masked_fill(zero, torch.inf)
 
-def is_inside(offset: Tensor, gauge: Tensor, zero: Tensor) -> Tensor:
-    """Tell whether an offset stays short of the boundary, given the gauge of its direction."""
-    return (offset.abs().amax(-1) * gauge < 1) | zero
+    def share(self, inner: Tensor) -> Tensor:
+        """Return the share of a ray's way through the outer set that lies in an inner one as well.
+
+        The outer gauge over the larger one of both, and 1 for an offset of zero. Where the inner
+        set does not bind the share is exactly 1, and its gradient 0. An inner gauge of NaN makes
+        the share NaN: a broken constraint must not pass for one that does not bind.
+
+        Args:
+            inner: the inner set's gauge in `direction`, ``(*stages, *batch)``.
+        """
+        return (inner / self._outer).clamp(min=1).reciprocal()
 
 
 def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:

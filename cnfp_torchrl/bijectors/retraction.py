@@ -5,15 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
-from cnfp_torchrl.bijectors.rays import (
-    is_inside,
-    scale_about,
-    scaled_direction,
-    set_batch_shape,
-    share_of,
-)
+from cnfp_torchrl.bijectors.bijector import Bijector
+from cnfp_torchrl.bijectors.rays import Rays, scale_about
 from cnfp_torchrl.geometry import ConstraintSet
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 class Retraction(Bijector):
@@ -32,14 +27,15 @@ class Retraction(Bijector):
 
     def __init__(self, outer: ConstraintSet, inner: ConstraintSet, centre: Tensor) -> None:
         super().__init__()
-        bounds = outer.bounding_box()
-        magnitude = torch.maximum(bounds.low.abs(), bounds.high.abs()).amax(-1)
-        self._outer, self._inner, self._centre = outer, inner.eroded(magnitude), centre
+        inner = inner.eroded(outer.bounding_box().magnitude())
+        self._outer, self._inner, self._centre = outer, inner, centre
+        self._outer_gauge = outer.gauge_about(centre)
+        self._inner_gauge = inner.gauge_about(centre)
 
     @property
     def shape(self) -> torch.Size:
         batch = broadcast_shape(
-            self._centre.shape[:-1], set_batch_shape(self._outer), set_batch_shape(self._inner)
+            self._centre.shape[:-1], self._outer.batch_shape, self._inner.batch_shape
         )
         return torch.Size((*batch, self._centre.shape[-1]))
 
@@ -52,16 +48,9 @@ class Retraction(Bijector):
         return scale_about(self._centre, action, 1 / share), -action.shape[-1] * share.log()
 
     def contains(self, action: Tensor) -> Tensor:
-        offset = action - self._centre
-        direction, zero = scaled_direction(offset)
-        _, inner = self._gauges(direction)
-        return is_inside(offset, inner, zero)
+        rays = Rays(action - self._centre, self._outer_gauge)
+        return rays.progress < rays.share(self._inner_gauge(rays.direction))
 
     def _share(self, offset: Tensor) -> Tensor:
-        direction, zero = scaled_direction(offset)
-        outer, inner = self._gauges(direction)
-        return share_of(outer, inner, zero)
-
-    def _gauges(self, direction: Tensor) -> tuple[Tensor, Tensor]:
-        outer = self._outer.gauge(direction, self._centre)
-        return outer, torch.maximum(outer, self._inner.gauge(direction, self._centre))
+        rays = Rays(offset, self._outer_gauge)
+        return rays.share(self._inner_gauge(rays.direction))

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.bijectors.bijector import Bijector, broadcast_shape
+from cnfp_torchrl.bijectors.bijector import Bijector
 from cnfp_torchrl.bijectors.hyperbolic import log_sech_squared
 from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
 from cnfp_torchrl.geometry import GeometryError, Region
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 class ShellSquash(Bijector):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Self
 
 import torch
@@ -11,29 +12,34 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Cone
 
 
-def ball_gauge(direction: Tensor, offset: Tensor, radius: Tensor) -> Tensor:
-    r"""Return the gauge of a ball of the given radius about a point at an offset from its centre.
+def ball_gauge_about(offset: Tensor, radius: Tensor) -> Gauge:
+    r"""Return the gauge of a ball about a point at an offset from the ball's centre.
 
-    With :math:`k = (r - |w|)(r + |w|)`, :math:`b = v \cdot w`, :math:`q = |v|^2`:
-    :math:`g = (b + \sqrt{b^2 + qk})/k`, rewritten for :math:`b < 0` as
-    :math:`q / (\sqrt{b^2 + qk} - b)`, so that neither form cancels.
+    With :math:`k = (r - |w|)(r + |w|)`, :math:`\beta = v \cdot w/k` and :math:`q = |v|^2/k`:
+    :math:`g = \beta + \sqrt{\beta^2 + q}`, which cancels for :math:`\beta < 0`. With
+    :math:`p = 2\max(\beta, 0)` and :math:`h = \sqrt{\beta^2 + q} + |\beta|`, written
+    :math:`\sqrt{\beta^2 + q} + p - \beta` to have the right gradient at 0, :math:`g = p + q/h`
+    never does.
 
     Args:
-        direction: v, ``(*batch, d)``, not zero.
         offset: w, the point minus the ball's centre, ``(*batch, d)``, shorter than the radius.
         radius: r, ``(*batch,)``.
     """
     distance = vector_norm(offset, dim=-1)
-    k = (radius - distance) * (radius + distance)
-    b = (direction * offset).sum(-1)
-    q = direction.square().sum(-1)
-    root = torch.sqrt(b.square() + q * k)
-    outwards = b >= 0
-    return torch.where(outwards, b + root, q) / torch.where(outwards, k, root - b)
+    inverse = 1 / ((radius - distance) * (radius + distance))
+    return partial(_gauge, offset * inverse.unsqueeze(-1), inverse)
+
+
+def _gauge(scaled_offset: Tensor, inverse: Tensor, direction: Tensor) -> Tensor:
+    beta = (direction * scaled_offset).sum(-1)
+    q = direction.square().sum(-1) * inverse
+    ahead = beta.relu()
+    h = torch.add(torch.addcmul(q, beta, beta).sqrt(), ahead, alpha=2) - beta
+    return torch.add(q / h, ahead, alpha=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,10 @@ class Ball(ConstraintSet):
         return self.radius - vector_norm(action - self.center, dim=-1)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return ball_gauge(direction, centre - self.center, self.radius)
+        return self.gauge_about(centre)(direction)
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        return ball_gauge_about(centre - self.center, self.radius)
 
     def bounding_box(self) -> Box:
         radius = self.radius.unsqueeze(-1)
@@ -71,20 +80,21 @@ class Ball(ConstraintSet):
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         size = self.radius + vector_norm(self.center, dim=-1)
-        return type(self)(self.center, self.radius - eps * size, validate_args=False)
+        return type(self)(self.center, torch.sub(self.radius, size, alpha=eps), validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
-        return type(self)(centre, torch.ones_like(centre[..., 0]), validate_args=False)
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        return type(self)(centre, radius.expand(centre.shape[:-1]), validate_args=False)
 
     def superlevel(self) -> Cone:
         identity = torch.eye(self.dim, dtype=self.dtype, device=self.center.device)
         return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
 
-    def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
+    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
         # The radius alone, because torch.where is slow where the mask broadcasts.
-        around = vector_norm(centre - self.center, dim=-1) + 1
-        radius = torch.where(active, self.radius, around)
-        return type(self)(self.center, radius, validate_args=False)
+        beyond = vector_norm(centre - self.center, dim=-1) + radius
+        return type(self)(
+            self.center, torch.where(active, self.radius, beyond), validate_args=False
+        )
 
     def inner_ball(self, radius: float) -> Self:
         r"""Return the ball of at most the given radius inside this one that is nearest to 0.

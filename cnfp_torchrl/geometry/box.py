@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Rows
 
 
@@ -37,29 +38,34 @@ class Box(ConstraintSet):
         return torch.minimum(self.high - action, action - self.low).amin(-1)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        # Not the larger of two quotients: its gradient costs three times as much.
-        ahead = direction.relu()
-        upper, lower = ahead / (self.high - centre), (ahead - direction) / (centre - self.low)
-        return (upper + lower).amax(-1)
+        return self.gauge_about(centre)(direction)
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        return partial(_gauge, 1 / (self.high - centre), 1 / (centre - self.low))
 
     def bounding_box(self) -> Box:
         return self
 
+    def magnitude(self) -> Tensor:
+        """Return the largest coordinate of any point, ``(*batch,)``."""
+        return torch.maximum(self.low.abs(), self.high.abs()).amax(-1)
+
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        # Beside an infinite bound coordinates, and their errors, are as large as the actions.
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.low.device)
-        size = torch.maximum(self.low.abs(), self.high.abs())
-        size = torch.where(size.isinf(), largest.unsqueeze(-1), size)
-        return type(self)(self.low + eps * size, self.high - eps * size, validate_args=False)
+        size = torch.minimum(torch.maximum(self.low.abs(), self.high.abs()), largest.unsqueeze(-1))
+        low, high = torch.add(self.low, size, alpha=eps), torch.sub(self.high, size, alpha=eps)
+        return type(self)(low, high, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
-        return type(self)(centre - 1, centre + 1, validate_args=False)
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        half = radius.unsqueeze(-1)
+        return type(self)(centre - half, centre + half, validate_args=False)
 
-    def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
+    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
         # Arithmetic, because torch.where is slow where the mask broadcasts. Where the set is active
         # the shift is so large that the bounds stay, wherever the centre is.
-        shift = active.to(self.dtype).unsqueeze(-1) * (torch.finfo(self.dtype).max / 2) - 1
+        shift = active.to(self.dtype) * (torch.finfo(self.dtype).max / 2) - radius
+        shift = shift.unsqueeze(-1)
         low = torch.minimum(self.low, centre + shift)
         high = torch.maximum(self.high, centre - shift)
         return type(self)(low, high, validate_args=False)
@@ -69,3 +75,10 @@ class Box(ConstraintSet):
         low, high = torch.broadcast_tensors(self.low, self.high)
         offsets = torch.cat([high, -low], -1)
         return Rows(torch.cat([identity, -identity]), offsets, torch.ones_like(offsets))
+
+
+def _gauge(above: Tensor, below: Tensor, direction: Tensor) -> Tensor:
+    """Return the gauge of a box from the inverse distances to its bounds, each ``(*batch, d)``."""
+    # Not the larger of two products: its gradient costs three times as much.
+    ahead = direction.relu()
+    return torch.addcmul(ahead * above, ahead - direction, below).amax(-1)

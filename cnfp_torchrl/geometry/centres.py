@@ -53,7 +53,7 @@ def lexicographic_centre(
     if not sets or not isinstance(sets[0], Box):
         given = [type(each).__name__ for each in sets]
         raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-    magnitude = torch.maximum(sets[0].low.abs(), sets[0].high.abs()).amax(-1)
+    magnitude = sets[0].magnitude()
     once = [each.eroded(magnitude) for each in sets]
     twice = [each.eroded(magnitude) for each in once]
     boxes = _common_box(twice)

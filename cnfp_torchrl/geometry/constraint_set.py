@@ -6,11 +6,13 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import InitVar, dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 from cnfp_torchrl.geometry.superlevel import Superlevel
 
 if TYPE_CHECKING:
@@ -18,6 +20,9 @@ if TYPE_CHECKING:
 
 EROSION_IN_EPS = 16.0
 """How many units of rounding error `ConstraintSet.eroded` moves a boundary inwards."""
+
+Gauge: TypeAlias = Callable[[Tensor], Tensor]
+"""The gauge of a set about a centre: directions ``(*batch, d)`` to values ``(*batch,)``."""
 
 
 class GeometryError(ValueError):
@@ -35,10 +40,11 @@ class ConstraintSet(ABC):
     - `event_dims`: the number of event dimensions of each field,
     - `slack`, `gauge`: its geometry,
     - `eroded`: the set moved inwards by the rounding error of its own arithmetic,
-    - `unit_about`: any well-conditioned set of the family around a point,
+    - `around`: a well-conditioned set of the family that contains a ball,
 
     and, where there is more to say than the defaults do,
 
+    - `gauge_about`: the gauge with all that does not depend on the direction computed once,
     - `violations`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
     - `superlevel`: what the search for centres needs to be fast.
@@ -86,8 +92,23 @@ class ConstraintSet(ABC):
         """
 
     @abstractmethod
-    def unit_about(self, centre: Tensor) -> Self:
-        """Return a set of this family, of size one, about a point, with fields shaped as here."""
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        """Return a set of this family that contains a ball, with fields shaped as here.
+
+        It takes a dropped set's place: it reaches beyond the action bounds, so that it never binds.
+
+        Args:
+            centre: of the ball, ``(*batch, d)``.
+            radius: of the ball, ``(*batch,)``, positive.
+        """
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        """Return the gauge about a centre, for many directions: what they share is computed once.
+
+        Args:
+            centre: ``(*batch, d)``, strictly inside the set.
+        """
+        return partial(self.gauge, centre=centre)
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
@@ -126,9 +147,8 @@ class ConstraintSet(ABC):
     @property
     def batch_shape(self) -> torch.Size:
         """The shape that the batch shapes of all fields broadcast to."""
-        return torch.broadcast_shapes(
-            *(value.shape[: value.ndim - self.event_dims[n]] for n, value in self.fields().items())
-        )
+        fields = ((getattr(self, name).shape, dims) for name, dims in self.event_dims.items())
+        return broadcast_shape(*(shape[: len(shape) - dims] for shape, dims in fields))
 
     @property
     def dim(self) -> int:
@@ -165,14 +185,15 @@ class ConstraintSet(ABC):
             validate_args=False,
         )
 
-    def unless_dropped(self, active: Tensor, centre: Tensor) -> Self:
-        """Return the set where it is active, and one of its family that holds the centre elsewhere.
+    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
+        """Return the set where it is active, and elsewhere one of its family that contains a ball.
 
         Args:
             active: boolean ``(*batch,)``.
-            centre: ``(*batch, d)``, inside the set where it is active.
+            centre: of the ball, ``(*batch, d)``.
+            radius: of the ball, ``(*batch,)``.
         """
-        return self.where(active, self.unit_about(centre))
+        return self.where(active, self.around(centre, radius))
 
     def validate(self, name: str | None = None) -> Self:
         """Return the set itself, or refuse it.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 from torch.linalg import solve_triangular, vector_norm
 
-from cnfp_torchrl.geometry.ball import ball_gauge
+from cnfp_torchrl.geometry.ball import ball_gauge_about
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Cone
 
 
@@ -57,10 +58,14 @@ class Ellipsoid(ConstraintSet):
         return (1 - white) / self._inverse_norm()
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        white_offset = self.whiten(centre - self.center)
-        return ball_gauge(
-            self.whiten(direction), white_offset, torch.ones_like(white_offset[..., 0])
-        )
+        return self.gauge_about(centre)(direction)
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        offset = self.whiten(centre - self.center)
+        return partial(self._gauge, ball_gauge_about(offset, torch.ones_like(offset[..., 0])))
+
+    def _gauge(self, of_unit_ball: Gauge, direction: Tensor) -> Tensor:
+        return of_unit_ball(self.whiten(direction))
 
     def bounding_box(self) -> Box:
         half = vector_norm(self.scale_tril, dim=-1)
@@ -76,8 +81,9 @@ class Ellipsoid(ConstraintSet):
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
 
-    def unit_about(self, centre: Tensor) -> Self:
-        return type(self)(centre, self._identity(), validate_args=False)
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        scale_tril = self._identity() * radius[..., None, None]
+        return type(self)(centre, scale_tril, validate_args=False)
 
     def superlevel(self) -> Cone:
         inverse = solve_triangular(self.scale_tril, self._identity(), upper=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Self
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Rows
 
 
@@ -55,8 +56,11 @@ class HalfSpaces(ConstraintSet):
         return (room / vector_norm(self.normals, dim=-1)).amin(-1)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        room = self.offsets - _rows(self.normals, centre)
-        return (_rows(self.normals, direction) / room).amax(-1).clamp(min=0)
+        return self.gauge_about(centre)(direction)
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        inverse = 1 / (self.offsets - _rows(self.normals, centre))
+        return partial(_gauge, self.normals, inverse)
 
     def bounding_box(self) -> Box:
         """Return the bounds that single rows with one component set; the others are infinite."""
@@ -73,10 +77,10 @@ class HalfSpaces(ConstraintSet):
         offsets = torch.where(self.offsets.isinf(), self.offsets, self.offsets - eps * size)
         return type(self)(self.normals, offsets, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
         normals[..., 0] = 1
-        offsets = centre[..., :1] + 1
+        offsets = centre[..., :1] + radius.unsqueeze(-1)
         return type(self)(
             normals.expand_as(self.normals),
             offsets.expand(*offsets.shape[:-1], self.offsets.shape[-1]),
@@ -85,6 +89,10 @@ class HalfSpaces(ConstraintSet):
 
     def superlevel(self) -> Rows:
         return Rows(self.normals, self.offsets, vector_norm(self.normals, dim=-1))
+
+
+def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:
+    return (_rows(normals, direction) * inverse_room).amax(-1).relu()
 
 
 def _rows(normals: Tensor, vector: Tensor) -> Tensor:

@@ -66,10 +66,10 @@ class KinkedSumBound(ConstraintSet):
         # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
         return Box(-bound / lower.abs(), bound / upper, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
         # The sum is at most |centre|_1 at the centre, and grows at most by one each unit.
         weights = torch.full_like(self.weights, self.dim**-0.5)
-        return type(self)(weights, centre.abs().sum(-1) + 1, validate_args=False)
+        return type(self)(weights, centre.abs().sum(-1) + radius, validate_args=False)
 
     def superlevel(self) -> KinkedSum:
         return KinkedSum(*self.slopes(self.weights), self.bound, vector_norm(self.weights, dim=-1))

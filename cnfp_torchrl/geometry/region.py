@@ -87,17 +87,18 @@ class Region:
     def eroded(self) -> Self:
         """Return the region whose points, computed in its dtype, lie in this one exactly.
 
-        A dropped set is replaced by one of its family around the centre, whose gauge is finite and
-        has finite gradients; it is masked anyway, but NaN times zero would be NaN.
+        A dropped set is replaced by one of its family that reaches beyond the action bounds, so
+        that all sets of the result are active: nothing needs a mask, and no gradient is NaN.
         """
-        magnitude = torch.maximum(self.bounds.low.abs(), self.bounds.high.abs()).amax(-1)
-        sets: list[ConstraintSet] = []
-        for stage, each in enumerate(self.sets):
-            shrunk = each.eroded(magnitude)
-            if self.active is not None and stage > 0:
-                shrunk = shrunk.unless_dropped(self.active[..., stage], self.centre)
-            sets.append(shrunk)
-        return type(self)(tuple(sets), self.centre, self.active, validate_args=False)
+        magnitude = self.bounds.magnitude()
+        sets = [each.eroded(magnitude) for each in self.sets]
+        if self.active is not None:
+            # No two points of the bounds are further apart than half of it.
+            beyond = magnitude * (4 * self.centre.shape[-1] ** 0.5)
+            for stage in range(1, len(sets)):
+                active = self.active[..., stage]
+                sets[stage] = sets[stage].unless_dropped(active, self.centre, beyond)
+        return type(self)(tuple(sets), self.centre, validate_args=False)
 
     @classmethod
     def build(cls, sets: Sequence[ConstraintSet], centre: Tensor | None = None) -> Self:

@@ -77,8 +77,9 @@ class VisibleOrBox(ConstraintSet):
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
         # Each is replaced where it does not count: its gauge about a centre outside of it may be
         # NaN, and so would the gradient be, even where it is masked.
-        region = self.region.where(self.sees, self.region.unit_about(centre))
-        box = self.box.where(~self.sees, self.box.unit_about(centre))
+        one = torch.ones_like(self.in_sight)
+        region = self.region.unless_dropped(self.sees, centre, one)
+        box = self.box.unless_dropped(~self.sees, centre, one)
         return torch.where(self.sees, region.gauge(direction, centre), box.gauge(direction, centre))
 
     def bounding_box(self) -> Box:
@@ -88,8 +89,9 @@ class VisibleOrBox(ConstraintSet):
         fields = {**self.region.eroded(magnitude).fields(), **self.box.eroded(magnitude).fields()}
         return type(self)(**fields, in_sight=self.in_sight, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
-        fields = {**self.region.unit_about(centre).fields(), **self.box.unit_about(centre).fields()}
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        parts = (self.region.around(centre, radius), self.box.around(centre, radius))
+        fields = {name: value for part in parts for name, value in part.fields().items()}
         return type(self)(**fields, in_sight=torch.zeros_like(self.in_sight), validate_args=False)
 
     def superlevel(self) -> Rows:

@@ -158,11 +158,11 @@ class VisibleRegion(ConstraintSet):
         rectangles = torch.stack([low - grown, high + grown], -2)
         return type(self)(self.position, rectangles, self.step, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Self:
-        # One wall, a unit or more beyond 0, which the centre moves the position to.
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        # One wall, the radius or more beyond 0, which the centre moves the position to.
         low = torch.full_like(self.rectangles[..., 0, :], -torch.inf)
         high = torch.full_like(low, torch.inf)
-        wall = (centre[..., :1].abs() + 1).unsqueeze(-2)
+        wall = (centre[..., :1].abs() + radius.unsqueeze(-1)).unsqueeze(-2)
         first = torch.arange(self.dim, device=low.device) == 0
         low = torch.where(first, wall, low)
         rectangles = torch.stack(torch.broadcast_tensors(low, high), -2)

@@ -286,8 +286,9 @@ class Slab(ConstraintSet):
         eps = 16 * torch.finfo(self.dtype).eps
         return Slab(self.normal, self.width - eps * size, validate_args=False)
 
-    def unit_about(self, centre: Tensor) -> Slab:
-        return Slab(self.normal, (self.normal * centre).sum(-1).abs() + 1, validate_args=False)
+    def around(self, centre: Tensor, radius: Tensor) -> Slab:
+        reach = torch.linalg.vector_norm(self.normal, dim=-1) * radius
+        return Slab(self.normal, (self.normal * centre).sum(-1).abs() + reach, validate_args=False)
 
 
 def test_a_new_family_needs_five_statements() -> None:

@@ -154,24 +154,27 @@ def test_gradients_are_finite(case: Case, dtype: torch.dtype) -> None:
             assert gradient.isfinite().all()
 
 
-def test_unit_about_has_the_fields_shapes_and_holds_the_centre(case: Case) -> None:
+def test_around_has_the_fields_shapes_and_contains_the_ball(case: Case) -> None:
     centre = 5 * torch.randn(*case.inside.shape, dtype=torch.float64)
-    unit = case.sets.unit_about(centre)
-    unit.validate()
-    assert (unit.slack(centre) > 0.1).all()
+    radius = torch.tensor(3.0, dtype=torch.float64)
+    around = case.sets.around(centre, radius)
+    around.validate()
+    way = case.directions(100, torch.float64)
+    on_sphere = centre + (1 - 1e-9) * radius * way / way.norm(dim=-1, keepdim=True)
+    assert around.contains(on_sphere).all()
     nowhere = torch.zeros(case.sets.batch_shape, dtype=torch.bool)
-    dropped = case.sets.unless_dropped(nowhere, centre)
-    assert (dropped.slack(centre) > 0.01).all()
-    kept = case.sets.unless_dropped(~nowhere, centre)
+    dropped = case.sets.unless_dropped(nowhere, centre, radius)
+    assert dropped.contains(on_sphere).all()
+    kept = case.sets.unless_dropped(~nowhere, centre, radius)
     assert (kept.slack(case.inside) == case.sets.slack(case.inside)).all()
-    mixed = case.sets.where(nowhere, unit)
+    mixed = case.sets.where(nowhere, around)
     for name, field in case.sets.fields().items():
         event = case.sets.event_dims[name]
         given = mixed.fields()[name]
         assert given.shape[given.ndim - event :] == field.shape[field.ndim - event :]
     way = case.directions(10, torch.float64).requires_grad_()
-    for around in (mixed, dropped):
-        gauge = around.gauge(way, centre)
+    for each in (mixed, dropped):
+        gauge = each.gauge(way, centre)
         assert gauge.isfinite().all()
         assert torch.autograd.grad(gauge.sum(), way)[0].isfinite().all()
 
