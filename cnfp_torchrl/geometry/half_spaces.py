@@ -21,10 +21,11 @@ class HalfSpaces(ConstraintSet):
     r"""The intersection of half-spaces, :math:`\{a : normals_j \cdot a \le offsets_j\}`.
 
     It need not be bounded. A control barrier function gives one row,
-    :math:`-L_g h \cdot a \le L_f h + \alpha(h)`.
+    :math:`-L_g h \cdot a \le L_f h + \alpha(h)`. A row whose normal is zero lets every action pass
+    where its offset is 0 or more, and none where it is less: there the constraint cannot hold.
 
     Args:
-        normals: ``(*batch, m, d)``, finite, none of them zero.
+        normals: ``(*batch, m, d)``, finite.
         offsets: ``(*batch, m)``; an infinite one lets every action pass.
     """
 
@@ -35,7 +36,6 @@ class HalfSpaces(ConstraintSet):
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
-        yield "normals", (self.normals == 0).all(-1), "a normal that is not zero"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
 
     def shape_problem(self) -> str | None:
@@ -52,14 +52,14 @@ class HalfSpaces(ConstraintSet):
         return (_rows(self.normals.double(), action.double()) <= self.offsets.double()).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
-        room = self.offsets - _rows(self.normals, action)
-        return (room / vector_norm(self.normals, dim=-1)).amin(-1)
+        offsets, lengths = self._offsets_and_lengths()
+        return ((offsets - _rows(self.normals, action)) / lengths).amin(-1)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
         return self.gauge_about(centre)(direction)
 
     def gauge_about(self, centre: Tensor) -> Gauge:
-        inverse = 1 / (self.offsets - _rows(self.normals, centre))
+        inverse = 1 / (self._offsets_and_lengths()[0] - _rows(self.normals, centre))
         return partial(_gauge, self.normals, inverse)
 
     def bounding_box(self) -> Box:
@@ -88,7 +88,14 @@ class HalfSpaces(ConstraintSet):
         )
 
     def superlevel(self) -> Rows:
-        return Rows(self.normals, self.offsets, vector_norm(self.normals, dim=-1))
+        return Rows(self.normals, *self._offsets_and_lengths())
+
+    def _offsets_and_lengths(self) -> tuple[Tensor, Tensor]:
+        """Return the offsets, infinite where every action passes, and the normals' lengths or 1."""
+        lengths = vector_norm(self.normals, dim=-1)
+        zero = lengths == 0
+        offsets = torch.where(zero & (self.offsets >= 0), torch.inf, self.offsets)
+        return offsets, lengths.masked_fill(zero, 1)
 
 
 def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:

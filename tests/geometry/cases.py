@@ -76,6 +76,14 @@ def _polytope(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
     return HalfSpaces(normals * 3, offsets), torch.zeros(*batch, d)
 
 
+def _half_spaces_with_zero_rows(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
+    normals = torch.randn(*batch, 3, d)
+    normals[..., 1:, :] = 0
+    offsets = torch.rand(*batch, 3) + 0.1
+    offsets[..., 2] = 0
+    return HalfSpaces(normals, offsets), torch.zeros(*batch, d)
+
+
 def _l1_ball(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
     weights = torch.randn(*batch, d)
     return WeightedL1Ball(weights, 0.5 + torch.rand(batch)), torch.zeros(*batch, d)
@@ -121,6 +129,7 @@ FAMILIES: dict[str, tuple[Make, tuple[int, ...]]] = {
     "thin-ellipsoid": (_thin_ellipsoid, (6,)),
     "half-space": (_half_space, (1, 2, 32)),
     "polytope": (_polytope, (2, 6, 32)),
+    "zero-rows": (_half_spaces_with_zero_rows, (2, 6)),
     "l1-ball": (_l1_ball, (1, 2, 6, 32)),
     "l1-ball-with-zeros": (_l1_ball_with_zeros, (2, 32)),
     "positive-part": (_positive_part, (1, 2, 6, 32)),

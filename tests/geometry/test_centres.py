@@ -304,6 +304,14 @@ def test_a_new_family_needs_five_statements() -> None:
         Slab(t(1.0, 1.0), t(torch.nan))
 
 
+def test_a_row_without_a_normal_holds_or_is_dropped() -> None:
+    rows = HalfSpaces(t([[0.0, 0.0]], [[0.0, 0.0]], [[1.0, 0.0]]), t([0.0], [-1e-3], [0.5]))
+    centre, active = lexicographic_centre([BOUNDS, rows])
+    assert active.tolist() == [[True, True], [True, False], [True, True]]
+    assert rows.contains(centre).tolist() == [True, False, True]
+    check([BOUNDS, rows], centre, active)
+
+
 def test_upper_bounds_are_tight() -> None:
     sets = [BOUNDS.with_fields(lambda f, _: f.expand(1, 2)), Ball(t([1.0, 0.0]), t(0.8))]
     best = chebyshev_centre(sets, share=0.999)

@@ -55,10 +55,6 @@ BAD: list[tuple[Callable[[], ConstraintSet], tuple[str, ...]]] = [
         ("Ellipsoid", "square 'scale_tril'", "1 by 2"),
     ),
     (
-        lambda: HalfSpaces(t([1.0, 0.0], [0.0, 0.0]), t(1.0, 2.0)),
-        ("HalfSpaces", "'normals'", "[1]", "not zero", "[0.0, 0.0]"),
-    ),
-    (
         lambda: HalfSpaces(t([1.0, INF]), t(1.0)),
         ("HalfSpaces", "'normals'", "[0, 1]", "finite", "inf"),
     ),
