@@ -1,6 +1,6 @@
 """Environments and the transforms that publish their constraints into the tensordict."""
 
-from cnfp_torchrl.envs.centre import ConstraintCentre, constraint_bijectors
+from cnfp_torchrl.envs.centre import ConstraintCentre, constrain_env, constraint_bijectors
 from cnfp_torchrl.envs.cost import ConstraintCost, constraint_names
 from cnfp_torchrl.envs.dynamics import PointNavDynamics, State, Transition
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
@@ -31,6 +31,7 @@ __all__ = [
     "State",
     "Transition",
     "VisibleObstacleGeometry",
+    "constrain_env",
     "constraint_bijectors",
     "constraint_names",
     "render_point_nav",

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from cnfp_torchrl.envs.geometry_transform import (
     SAFE_ACTION_KEY,
@@ -29,6 +29,28 @@ def constraint_bijectors(env: TransformedEnv) -> list[ConstraintBijector]:
         for transform in appended_transforms(env)
         if isinstance(transform, GeometryTransform)
     ]
+
+
+def constrain_env(
+    env: EnvBase, *geometries: GeometryTransform, order: Sequence[str] | None = None
+) -> TransformedEnv:
+    """Let an environment publish what each state allows: geometries, centre and active flags.
+
+    The counterpart of `cnfp_torchrl.modules.constrain`, which makes an actor heed them; its
+    bijectors are ``constraint_bijectors(env)``.
+
+    Args:
+        env: with a bounded action spec; not changed.
+        geometries: one transform for each constraint.
+        order: the constraints' names in order of application, the last with the highest priority;
+            None takes the order of the geometries. The same as the actor's.
+
+    Raises:
+        ValueError: when an order does not name each constraint exactly once.
+    """
+    published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
+    bijectors = constraint_bijectors(published)
+    return published.append_transform(ConstraintCentre(bijectors, order))
 
 
 class ConstraintCentre(Transform):

@@ -32,9 +32,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import ConstraintCentre, GeometryTransform, constraint_bijectors
+from cnfp_torchrl.envs import GeometryTransform, constrain_env, constraint_bijectors
 from cnfp_torchrl.geometry import ConstraintSet, HalfSpaces
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
@@ -106,14 +106,13 @@ def push(observation: Tensor) -> tuple[Tensor, Tensor]:
 
 def run(control: Control, *, steps: int, agents: int, unsafe: bool = False) -> TensorDictBase:
     """Return the agents' steps under a control, ``(agents, steps)``."""
-    env = TransformedEnv(DoubleIntegrator(agents), Barrier("wall"))
-    bijectors = constraint_bijectors(env)
-    if not unsafe:
-        env.append_transform(ConstraintCentre(bijectors))
+    env = constrain_env(DoubleIntegrator(agents), Barrier("wall"))
     actor = TensorDictSequential(
         TensorDictModule(control, in_keys=["observation"], out_keys=["loc", "scale"]),
         ConstrainedFlowModule(
-            env.action_spec_unbatched, bijectors, flow="none" if unsafe else "exact"
+            env.action_spec_unbatched,
+            constraint_bijectors(env),
+            flow="none" if unsafe else "exact",
         ),
     )
     return env.rollout(steps, actor)

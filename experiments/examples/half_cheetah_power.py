@@ -11,9 +11,9 @@ import argparse
 import torch
 from sac_made_safe import make_actor, train
 from tensordict import TensorDictBase
-from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
+from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import ConstraintCentre, GeometryTransform, constraint_bijectors
+from cnfp_torchrl.envs import GeometryTransform, constrain_env, constraint_bijectors
 from cnfp_torchrl.geometry import WeightedL1Ball
 from cnfp_torchrl.modules import constrain
 
@@ -31,10 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="HalfCheetah with a limited power, by SAC.")
     parser.add_argument("--steps", type=int, default=2000, help="environment steps")
     arguments = parser.parse_args()
-    env = TransformedEnv(GymEnv("HalfCheetah-v5"), Compose(DoubleToFloat(), PowerLimit("power")))
-    bijectors = constraint_bijectors(env)
-    env.append_transform(ConstraintCentre(bijectors))
-    actor = constrain(make_actor(env), *bijectors)
+    cheetah = TransformedEnv(GymEnv("HalfCheetah-v5"), DoubleToFloat())
+    env = constrain_env(cheetah, PowerLimit("power"))
+    actor = constrain(make_actor(env), *constraint_bijectors(env))
     steps = train(env, actor, steps=arguments.steps, updates=8)
     power = (steps["observation"][..., 11:].double() * steps["action"].double()).abs().sum(-1)
     print(f"power: mean {power.mean():.2f}, largest {power.max():.6f}, limit 20")

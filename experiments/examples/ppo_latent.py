@@ -7,16 +7,15 @@ import argparse
 
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cnfp_torchrl.envs import (
     BatteryGeometry,
-    ConstraintCentre,
     ObstacleGeometry,
     PointNavEnv,
+    constrain_env,
     constraint_bijectors,
 )
 from cnfp_torchrl.modules import make_constrained_actor, split_at_latent
@@ -34,9 +33,8 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
 
     base_env = PointNavEnv([arguments.agents], seed=arguments.seed)
-    env = TransformedEnv(base_env, Compose(BatteryGeometry(), ObstacleGeometry()))
+    env = constrain_env(base_env, BatteryGeometry(), ObstacleGeometry())
     bijectors = constraint_bijectors(env)
-    env.append_transform(ConstraintCentre(bijectors))
     network = torch.nn.Sequential(MLP(5, 4, num_cells=[64, 64]), NormalParamExtractor())
     actor = make_constrained_actor(network, env.action_spec_unbatched, bijectors)
     policy, latent_actor = split_at_latent(actor)  # for the collector, and for the loss

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.modules import (
     MLP,
     NormalParamExtractor,
@@ -25,9 +25,9 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from cnfp_torchrl.envs import (
     BatteryGeometry,
-    ConstraintCentre,
     ObstacleGeometry,
     PointNavEnv,
+    constrain_env,
     constraint_bijectors,
 )
 from cnfp_torchrl.modules import constrain
@@ -47,20 +47,16 @@ def main() -> None:
     env: EnvBase = PointNavEnv([arguments.agents], seed=arguments.seed)
     actor = make_actor(env)
     if not arguments.unsafe:
-        env = with_constraints(env)  # publishes what each state allows
-        actor = constrain(actor, *constraint_bijectors(env))  # appends it to the actor
+        # The environment publishes what each state allows, the last constraint first; the actor
+        # heeds it.
+        env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
+        actor = constrain(actor, *constraint_bijectors(env))
 
     steps = train(env, actor, steps=arguments.steps, updates=arguments.updates)
     reward, last = steps["next", "reward"], -len(steps) // 4
     print(f"mean reward {reward.mean():.2f}, in the last quarter {reward[last:].mean():.2f}")
     for name, count in zip(env.constraint_names, steps["next", "cost"].sum(0), strict=True):
         print(f"{name}: {count:.0f} violations in {len(steps)} steps")
-
-
-def with_constraints(env: EnvBase) -> TransformedEnv:
-    """Let the environment publish the allowed actions of each state; the last one has priority."""
-    env = TransformedEnv(env, Compose(BatteryGeometry(), ObstacleGeometry()))
-    return env.append_transform(ConstraintCentre(constraint_bijectors(env)))
 
 
 def make_actor(env: EnvBase) -> ProbabilisticActor:

@@ -13,15 +13,14 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
-from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 from cnfp_torchrl.envs import (
     BatteryGeometry,
-    ConstraintCentre,
     ObstacleGeometry,
     PointNavEnv,
+    constrain_env,
     constraint_bijectors,
 )
 from cnfp_torchrl.modules import ConstrainedFlowModule, FlowMap
@@ -38,9 +37,8 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
 
     base_env = PointNavEnv([arguments.agents], seed=arguments.seed)
-    env = TransformedEnv(base_env, Compose(BatteryGeometry(), ObstacleGeometry()))
+    env = constrain_env(base_env, BatteryGeometry(), ObstacleGeometry())
     bijectors = constraint_bijectors(env)
-    env.append_transform(ConstraintCentre(bijectors))
     flow = FlowMap(ConstrainedFlowModule(env.action_spec_unbatched, bijectors))
     network = TensorDictModule(MLP(5, 2, num_cells=[64, 64]), ["observation"], ["latent"])
     # The latent starts near N(0, 1) and ends near the network's choice.

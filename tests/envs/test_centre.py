@@ -22,6 +22,7 @@ from cnfp_torchrl.envs import (
     GeometryTransform,
     ObstacleGeometry,
     PointNavEnv,
+    constrain_env,
     constraint_bijectors,
 )
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, GeometryError, HalfSpaces
@@ -351,3 +352,19 @@ def test_bijectors_are_those_of_the_geometries() -> None:
         ("obstacle", Box),
         ("battery", Ball),
     ]
+
+
+def test_constrain_env_publishes_everything_the_actor_needs() -> None:
+    base = TransformedEnv(PointNavEnv([3], seed=0), RewardSum())
+    env = constrain_env(base, ObstacleGeometry(), BatteryGeometry(), order=ORDER)
+    check_env_specs(env)
+    assert [bijector.name for bijector in constraint_bijectors(env)] == ["obstacle", "battery"]
+    assert isinstance(base.transform, RewardSum)
+    by_hand = TransformedEnv(
+        PointNavEnv([3], seed=0), Compose(RewardSum(), BatteryGeometry(), ObstacleGeometry())
+    )
+    by_hand.append_transform(ConstraintCentre(constraint_bijectors(by_hand)))
+    given, expected = (each.reset()["constraints"] for each in (env, by_hand))
+    assert (given == expected).all()
+    with pytest.raises(ValueError, match="order: expected each of the constraints"):
+        constrain_env(base, BatteryGeometry(), order=ORDER)

@@ -10,7 +10,7 @@ import pytest
 from tensordict import TensorDictBase
 from torchrl.objectives import ClipPPOLoss
 
-from cnfp_torchrl.envs import PointNavEnv
+from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constrain_env
 
 TINY: dict[str, tuple[object, ...]] = {
     "sac_made_safe": ("--steps", 512, "--agents", 16, "--updates", 2),
@@ -89,7 +89,7 @@ def test_without_the_line_it_breaks_constraints(
 
 def test_the_sac_actor_itself_learns(load: Callable[[str], ModuleType]) -> None:
     script = load("sac_made_safe")
-    env = script.with_constraints(PointNavEnv([8], seed=0))
+    env = constrain_env(PointNavEnv([8], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = script.make_actor(env)
     safe = script.constrain(actor, *script.constraint_bijectors(env))
     before = [parameter.detach().clone() for parameter in actor.parameters()]
