@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 CONSTRAINTS := .ci/constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate audit test test-slow bench check lint types format clean
+.PHONY: help install train evaluate audit view explain test test-slow bench paper figures check lint types format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,8 +33,20 @@ test-slow: $(STAMP) ## Run the tests marked slow
 bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 minutes)
 	$(PY) experiments/benchmarks/flows.py $(ARGS)
 
+paper: $(STAMP) ## Repeat the paper's experiment in outputs/paper (ARGS="--methods exact --seeds 0-4")
+	$(PY) -m experiments.paper $(ARGS)
+
+figures: $(STAMP) ## Redraw the figures and the report of the kept data in experiments/paper
+	$(PY) -m experiments.paper.report $(ARGS)
+
 audit: $(STAMP) ## Look for flaws in the constraints' geometry (ARGS="key=value ...")
 	$(PY) experiments/audit.py $(ARGS)
+
+view: $(STAMP) ## Open the newest recording in a Rerun viewer (ARGS="--web" for a browser)
+	$(PY) experiments/view.py $(ARGS)
+
+explain: $(STAMP) ## Say in words what a policy did (ARGS="RUN --step N")
+	$(PY) experiments/explain.py $(ARGS)
 
 check: lint types ## Check format, lint and types
 

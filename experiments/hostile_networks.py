@@ -1,4 +1,4 @@
-"""Put hostile networks behind the exact flows, count the violations, and keep the result.
+"""Put hostile networks behind the safe flows, count the violations, and keep the result.
 
     python experiments/hostile_networks.py [--steps 1000000] [--agents 2000] [--seed 0]
 
@@ -37,7 +37,7 @@ from cnfp_torchrl.modules import flow_head, make_constrained_actor
 from cnfp_torchrl.training.agent import build_actor, build_environment
 
 RESULT = Path(__file__).parent / "results" / "hostile_networks.json"
-FLOWS = ("exact", "radial")
+FLOWS = ("exact", "radial", "projection")
 HUGE = 1e6
 
 Mean = Callable[[Tensor], Tensor]

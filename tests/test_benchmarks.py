@@ -12,6 +12,17 @@ def test_flows_are_timed_and_tabulated(tmp_path: Path) -> None:
     script = ROOT / "experiments" / "benchmarks" / "flows.py"
     subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
     (row,) = json.loads((tmp_path / "flows.json").read_text())["rows"]
-    assert row["exact"]["backward"] > row["exact"]["sample"] > 0
-    ratio = row["exact"]["sample"] / row["TanhNormal"]["sample"]
-    assert f"{ratio:.2f}" in (tmp_path / "flows.md").read_text()
+    assert row["exact"]["sample"]["ms"] > 0
+    assert row["TanhNormal"]["sample"]["ratio"] == 1
+    assert f"{row['exact']['sample']['ratio']:.2f}" in (tmp_path / "flows.md").read_text()
+
+
+def test_the_stream_is_timed_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "stream.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    document = json.loads((tmp_path / "stream.json").read_text())
+    assert document["setting"]["imported_when_off"] == "False"
+    text = (tmp_path / "stream.md").read_text()
+    for name, row in document["rows"].items():
+        (milliseconds,) = row["ms"]
+        assert f"| {name} | {milliseconds:.2f} |" in text

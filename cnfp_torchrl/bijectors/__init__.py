@@ -7,6 +7,7 @@ from cnfp_torchrl.bijectors.chain import BijectorChain
 from cnfp_torchrl.bijectors.ellipsoid_squash import EllipsoidSquash
 from cnfp_torchrl.bijectors.gauge_squash import GaugeSquash
 from cnfp_torchrl.bijectors.paper_squash import paper_squash
+from cnfp_torchrl.bijectors.projection import NoDensityError, Projection
 from cnfp_torchrl.bijectors.radial_squash import RadialSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
@@ -18,6 +19,8 @@ __all__ = [
     "BoxSquash",
     "EllipsoidSquash",
     "GaugeSquash",
+    "NoDensityError",
+    "Projection",
     "RadialSquash",
     "Retraction",
     "ShellSquash",

@@ -7,6 +7,7 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
 from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.positive_part import PositivePart
+from cnfp_torchrl.geometry.projection import project, project_onto_intersection
 from cnfp_torchrl.geometry.region import Region
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 from cnfp_torchrl.geometry.visible_or_box import VisibleOrBox
@@ -32,4 +33,6 @@ __all__ = [
     "WeightedL1Ball",
     "chebyshev_centre",
     "lexicographic_centre",
+    "project",
+    "project_onto_intersection",
 ]

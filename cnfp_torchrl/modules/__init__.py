@@ -3,12 +3,20 @@
 from cnfp_torchrl.modules.actors import (
     constrain,
     flow_head,
+    has_density,
     make_constrained_actor,
     with_reference_entropy,
 )
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, MissingGeometryError
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
-from cnfp_torchrl.modules.flows import ExactFlow, Flow, PaperChain, RadialFlow, UnconstrainedFlow
+from cnfp_torchrl.modules.flows import (
+    ExactFlow,
+    Flow,
+    PaperChain,
+    ProjectionFlow,
+    RadialFlow,
+    UnconstrainedFlow,
+)
 from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
@@ -24,6 +32,7 @@ __all__ = [
     "LatentActor",
     "MissingGeometryError",
     "PaperChain",
+    "ProjectionFlow",
     "RadialFlow",
     "SafeRandomPolicy",
     "UnconstrainedFlow",
@@ -31,6 +40,7 @@ __all__ = [
     "constrain",
     "flow_head",
     "guarded",
+    "has_density",
     "make_constrained_actor",
     "split_at_latent",
     "with_reference_entropy",

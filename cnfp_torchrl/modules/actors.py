@@ -144,6 +144,12 @@ def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule
     return head
 
 
+def has_density(actor: ProbabilisticTensorDictSequential) -> bool:
+    """Tell whether an actor's actions have a log-density, which projected ones have not."""
+    head = _parts(actor)[-1]
+    return head.flow.has_density if isinstance(head, ConstrainedFlowModule) else True
+
+
 def _parts(actor: ProbabilisticTensorDictSequential) -> list[Any]:
     """Return the modules of an actor."""
     if not isinstance(actor, ProbabilisticTensorDictSequential):

@@ -49,7 +49,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         kwargs: passed on to `torchrl.modules.SafeProbabilisticModule`, such as ``log_prob_key``.
 
     Raises:
-        ValueError: when the spec is unbounded or an order does not name each constraint once.
+        ValueError: when the spec is unbounded, when an order does not name each constraint once, or
+            for the log-density of a flow that has none.
     """
 
     distribution_type: type[ConstrainedFlow] = ConstrainedFlow
@@ -83,6 +84,11 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         self.register_buffer("high", bounds.high, persistent=False)
         self._bijectors = nn.ModuleList(in_order(bijectors, order))
         self.flow = resolve_flow(flow)
+        if return_log_prob and not self.flow.has_density:
+            raise ValueError(
+                f"return_log_prob: expected False for {type(self.flow).__name__}, whose actions "
+                "have no density, given True; leave it out, or take another flow"
+            )
         self.parameter_keys = list(in_keys)
         self.in_keys = [*in_keys, *self.geometry_keys()]
 

@@ -16,6 +16,7 @@ from cnfp_torchrl.bijectors import (
     BijectorChain,
     BoxSquash,
     GaugeSquash,
+    Projection,
     RadialSquash,
     paper_squash,
 )
@@ -30,6 +31,9 @@ class Flow(ABC):
 
     reads_constraints: ClassVar[bool] = True
     """Whether the constraints' sets are looked at."""
+
+    has_density: ClassVar[bool] = True
+    """Whether actions have a log-density; without one, only the reference entropy exists."""
 
     @abstractmethod
     def __call__(
@@ -79,7 +83,7 @@ class RadialFlow(Flow):
         active: Tensor | None,
     ) -> RadialSquash:
         assert centre is not None
-        return RadialSquash(Region((bounds, *sets), centre, active))
+        return RadialSquash(Region((bounds, *sets), centre, active, validate_args=False))
 
 
 class PaperChain(Flow):
@@ -115,6 +119,36 @@ class PaperChain(Flow):
         )
 
 
+class ProjectionFlow(Flow):
+    """A baseline: the tanh-squashed Gaussian's action, projected onto the intersection.
+
+    No bijection, so that no densities exist (`cnfp_torchrl.bijectors.Projection`). For boxes, balls
+    and half-spaces; a box with one ball, as in point navigation, is projected onto exactly.
+
+    Args:
+        rounds: of Dykstra's algorithm, for other intersections; what it leaves is retracted.
+    """
+
+    is_exact = True
+    has_density = False
+
+    def __init__(self, rounds: int = 50) -> None:
+        if rounds < 1:
+            raise ValueError(f"rounds: expected a number >= 1, given {rounds}")
+        self.rounds = rounds
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> Projection:
+        assert centre is not None
+        region = Region((bounds, *sets), centre, active, validate_args=False)
+        return Projection(region, rounds=self.rounds, validate_args=False)
+
+
 class UnconstrainedFlow(Flow):
     """The tanh squash into the action bounds alone, what any SAC does."""
 
@@ -135,6 +169,7 @@ FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "radial": RadialFlow,
     "squash": PaperChain,
+    "projection": ProjectionFlow,
     "none": UnconstrainedFlow,
 }
 

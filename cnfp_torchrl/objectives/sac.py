@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.objectives import SACLoss, ValueEstimators
 
-from cnfp_torchrl.modules import with_reference_entropy
+from cnfp_torchrl.modules import has_density, with_reference_entropy
 
 Entropy = Literal["reference", "action"]
 
@@ -30,7 +30,8 @@ class ConstrainedSACLoss(SACLoss):
         kwargs: passed on to `torchrl.objectives.SACLoss`.
 
     Raises:
-        ValueError: for an unknown entropy or a discount outside [0, 1).
+        ValueError: for an unknown entropy, for ``action`` where actions have no density, and for a
+            discount outside [0, 1).
     """
 
     def __init__(
@@ -46,6 +47,11 @@ class ConstrainedSACLoss(SACLoss):
             raise ValueError(f"entropy: expected 'reference' or 'action', given {entropy!r}")
         if not 0 <= gamma < 1:
             raise ValueError(f"gamma: expected a discount in [0, 1), given {gamma}")
+        if entropy == "action" and not has_density(actor_network):
+            raise ValueError(
+                "entropy: expected 'reference' for an actor whose actions have no density, such as "
+                f"one that projects them, given {entropy!r}"
+            )
         scored = with_reference_entropy(actor_network) if entropy == "reference" else actor_network
         super().__init__(scored, qvalue_network, **kwargs)
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import SACLoss
-from torchrl.objectives.utils import _vmap_func, distance_loss
+from torchrl.objectives.utils import _vmap_func
 
 from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
 
@@ -32,8 +32,8 @@ class SACLagrangianLoss(ConstrainedSACLoss):
 
     .. math::
         L_\pi &= E[\alpha \log\pi(a|s) - \min_i Q_i(s, a) + \sum_k \lambda_k Q_{c,k}(s, a)] \\
-        L_{Q_c} &= E[\textstyle\sum_k \ell(Q_{c,k}(s, a),\;
-            c_k + \gamma_c (1 - \text{terminated}) \bar Q_{c,k}(s', a'))], \quad a' \sim \pi(s') \\
+        L_{Q_c} &= E[\textstyle\sum_k (Q_{c,k}(s, a) - c_k
+            - \gamma_c (1 - \text{terminated}) \bar Q_{c,k}(s', a'))^2], \quad a' \sim \pi(s') \\
         L_\lambda &= -\sum_k \lambda_k (E[Q_{c,k}(s, a)] - \epsilon_k), \quad
             0 < \lambda_k \le \lambda_{max}
 
@@ -54,7 +54,8 @@ class SACLagrangianLoss(ConstrainedSACLoss):
     Args:
         actor_network: as for `ConstrainedSACLoss`.
         qvalue_network: as for `ConstrainedSACLoss`.
-        cost_network: reads observation and action, writes ``state_action_cost`` ``(*batch, K)``.
+        cost_network: reads observation and action, writes ``state_action_cost`` ``(*batch, K)``;
+            best one that cannot be negative, as costs cannot.
         thresholds: :math:`\epsilon_k \ge 0`, one for each constraint, in discounted costs: a
             violation in every step is worth 1 / (1 - gamma_cost).
         constraint_names: of the columns of ``cost``, for the log; None numbers them.
@@ -217,7 +218,9 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         action = tensordict.get(self.tensor_keys.action)
         predicted = self._cost(tensordict, action, self.cost_network_params)
         target = self._cost_target(tensordict).expand_as(predicted)
-        loss = distance_loss(predicted, target, loss_function=self.loss_function)
+        # Not the robust loss of the value critic: it estimates something like a median, and that of
+        # a rare event, such as reaching a station just in time, is its absence.
+        loss = (predicted - target).square()
         return self._reduce_loss(
             loss.sum(-1).sum(0),
             tensordict=tensordict,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -19,9 +19,10 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import ConstrainedFlowModule, SafeRandomPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.baselines import StandStill
-from cnfp_torchrl.training.evaluation import evaluate
+from cnfp_torchrl.training.evaluation import evaluate_seeded
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.watching import RECORDING, Watch, watch_run
 
 
 def evaluate_run(
@@ -50,9 +51,7 @@ def evaluate_run(
         policies[name] = (make(exact), False)
     reports = {}
     for name, (policy, deterministic) in policies.items():
-        env.set_seed(settings.seed)
-        torch.manual_seed(settings.seed)
-        result = evaluate(env, policy, episodes=settings.episodes, deterministic=deterministic)
+        result = evaluate_seeded(env, policy, settings, deterministic=deterministic)
         reports[name] = result.report(score)
     return reports
 
@@ -75,12 +74,25 @@ def table(reports: Mapping[str, Mapping[str, Any]]) -> str:
 
 @hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
 def main(config: DictConfig) -> None:
-    """Evaluate a run, print a table and write ``evaluation.json``."""
+    """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""
     settings: EvaluationSettings = instantiate(config.evaluation)
+    watch: Watch | None = instantiate(config.visual, _convert_="all") or None
     trusted = tuple(config.trusted)
-    reports = evaluate_run(RunFolder.open(config.run), settings, trusted=trusted)
-    output = Path(HydraConfig.get().runtime.output_dir) / "evaluation.json"
-    document = {"run": str(config.run), "seed": settings.seed, "policies": reports}
+    folder = RunFolder.open(config.run)
+    place = Path(HydraConfig.get().runtime.output_dir)
+    watched: AbstractContextManager[Any] = nullcontext()
+    if watch is not None:
+        watched = closing(watch_run(folder, settings, watch, place / RECORDING, trusted=trusted))
+    with watched:
+        _report(folder, settings, place, trusted)
+
+
+def _report(
+    folder: RunFolder, settings: EvaluationSettings, place: Path, trusted: tuple[str, ...]
+) -> None:
+    reports = evaluate_run(folder, settings, trusted=trusted)
+    output = place / "evaluation.json"
+    document = {"run": str(folder.path), "seed": settings.seed, "policies": reports}
     output.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
     sys.stdout.write(f"{table(reports)}\n{output}\n")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import torch
@@ -13,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.training.environment import counted_constraints
+from cnfp_torchrl.training.settings import EvaluationSettings
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,28 @@ class Evaluation:
         }
 
 
+def evaluate_seeded(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    settings: EvaluationSettings,
+    *,
+    deterministic: bool = False,
+    see: Callable[[TensorDictBase], None] | None = None,
+) -> Evaluation:
+    """Run the episodes that a seed determines: starts, goals and what the policy draws.
+
+    Args:
+        env: see `evaluate`.
+        policy: see `evaluate`.
+        settings: number of episodes and the seed.
+        deterministic: see `evaluate`.
+        see: see `evaluate`.
+    """
+    env.set_seed(settings.seed)
+    torch.manual_seed(settings.seed)
+    return evaluate(env, policy, episodes=settings.episodes, deterministic=deterministic, see=see)
+
+
 @torch.no_grad()
 def evaluate(
     env: EnvBase,
@@ -77,6 +102,7 @@ def evaluate(
     episodes: int,
     deterministic: bool = False,
     max_steps: int = 10_000,
+    see: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Run a policy for whole episodes and count.
 
@@ -86,10 +112,12 @@ def evaluate(
         episodes: how many.
         deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
         max_steps: a longer episode is an error: the environment never ends.
+        see: is shown every transition of every batch, of the environment's batch size.
 
     Raises:
         ValueError: when `episodes` is not positive.
         RuntimeError: when an episode outlasts `max_steps`.
+        FloatingPointError: when a return is not finite.
     """
     if episodes < 1:
         raise ValueError(f"episodes: expected a number >= 1, given {episodes}")
@@ -100,24 +128,47 @@ def evaluate(
     steps = 0
     with set_exploration_type(mode):
         while sum(len(each) for each in returns) < episodes:
-            batch_return, batch_cost, batch_steps = _run_batch(env, policy, len(names), max_steps)
+            shown = _shown(transitions(env, policy), see)
+            batch_return, batch_cost, batch_steps = _run_batch(env, shown, len(names), max_steps)
             returns.append(batch_return)
             costs.append(batch_cost)
             steps += batch_steps
-    return Evaluation(torch.cat(returns)[:episodes], torch.cat(costs)[:episodes], names, steps)
+    kept = torch.cat(returns)[:episodes]
+    if not bool(kept.isfinite().all()):
+        broken = int((~kept.isfinite()).sum())
+        raise FloatingPointError(
+            f"return: expected finite numbers, but those of {broken} of {episodes} episodes are "
+            "not; look at the environment's reward and at the policy's parameters"
+        )
+    return Evaluation(kept, torch.cat(costs)[:episodes], names, steps)
+
+
+def transitions(env: EnvBase, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
+    """Reset an environment and yield its transitions under a policy, without end."""
+    state: TensorDictBase = env.reset()
+    while True:
+        transition, state = env.step_and_maybe_reset(policy(state))
+        yield transition
+
+
+def _shown(
+    steps: Iterator[TensorDictBase], see: Callable[[TensorDictBase], None] | None
+) -> Iterator[TensorDictBase]:
+    for transition in steps:
+        if see is not None:
+            see(transition)
+        yield transition
 
 
 def _run_batch(
-    env: EnvBase, policy: TensorDictModuleBase, constraints: int, max_steps: int
+    env: EnvBase, stream: Iterator[TensorDictBase], constraints: int, max_steps: int
 ) -> tuple[Tensor, Tensor, int]:
-    state: TensorDictBase = env.reset()
     size = env.batch_size.numel()
-    running = torch.ones(size, dtype=torch.bool, device=state.device)
-    returns = torch.zeros(size, device=state.device)
-    costs = torch.zeros(size, constraints, device=state.device)
+    running = torch.ones(size, dtype=torch.bool, device=env.device)
+    returns = torch.zeros(size, device=env.device)
+    costs = torch.zeros(size, constraints, device=env.device)
     steps = 0
-    for _ in range(max_steps):
-        transition, state = env.step_and_maybe_reset(policy(state))
+    for transition in islice(stream, max_steps):
         outcome = transition.get("next")
         returns += running * outcome.get("reward").reshape(size)
         if constraints:

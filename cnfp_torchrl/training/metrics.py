@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
@@ -33,6 +34,8 @@ class Metrics:
         interval: int,
     ) -> None:
         self.frames = 0
+        self._started = time.perf_counter(), time.process_time()
+        self._logged_at = 0
         self.violations = dict.fromkeys(constraint_names, 0)
         self._loggers = list(loggers)
         self._interval = interval
@@ -66,24 +69,35 @@ class Metrics:
         """Write an entry of the log when the interval has passed.
 
         Raises:
-            FloatingPointError: when a loss is not finite.
+            FloatingPointError: when a loss or a return is not finite.
         """
-        if self.frames < self._next_log:
-            return
-        self._next_log += self._interval
+        if self.frames >= self._next_log:
+            self._next_log += self._interval
+            self._log_entry()
+
+    def finish(self) -> None:
+        """Write what is left as a last entry, and finish the progress bar.
+
+        Raises:
+            FloatingPointError: when a loss or a return is not finite.
+        """
+        if self.frames > self._logged_at:
+            self._log_entry()
+        self._bar.close()
+
+    def _log_entry(self) -> None:
+        self._logged_at = self.frames
+        wall, processor = self._started
+        self._log("train/seconds", time.perf_counter() - wall)
+        self._log("train/processor_seconds", time.process_time() - processor)
         if self._returns:
-            self._last_return = float(torch.cat(self._returns).mean())
+            self._last_return = self._finite("return", torch.cat(self._returns))
             self._log("train/return", self._last_return)
             self._returns.clear()
         for name, count in self.violations.items():
             self._log(f"violations/{name}", count)
         for name, values in self._losses.items():
-            mean = float(torch.stack(values).mean())
-            if not math.isfinite(mean):
-                raise FloatingPointError(
-                    f"{name} became {mean} by step {self.frames}: the run has diverged; lower "
-                    "optim.lr, or look at the logged losses"
-                )
+            mean = self._finite(name, torch.stack(values))
             is_loss = name.startswith("loss_")
             self._log(f"loss/{name.removeprefix('loss_')}" if is_loss else f"train/{name}", mean)
         self._losses.clear()
@@ -93,9 +107,14 @@ class Metrics:
         total = sum(self.violations.values())
         self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
 
-    def close(self) -> None:
-        """Finish the progress bar."""
-        self._bar.close()
+    def _finite(self, name: str, values: Tensor) -> float:
+        mean = float(values.mean())
+        if not math.isfinite(mean):
+            raise FloatingPointError(
+                f"{name} became {mean} by step {self.frames}: the run has diverged; lower "
+                "optim.lr, or look at the logged losses"
+            )
+        return mean
 
     def _log(self, name: str, value: float) -> None:
         for logger in self._loggers:

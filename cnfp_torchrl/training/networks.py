@@ -69,7 +69,7 @@ def action_cost_network(
     *,
     hidden: Sequence[int] = (256, 256),
 ) -> TensorDictModule:
-    """Return a critic of ``observation`` and ``action`` that writes ``state_action_cost``.
+    """Return a critic of ``observation`` and ``action`` that writes ``state_action_cost`` > 0.
 
     Args:
         observation_size: number of observed numbers.
@@ -83,4 +83,6 @@ def action_cost_network(
         num_cells=list(hidden),
         activation_class=nn.ReLU,
     )
-    return TensorDictModule(network, ["observation", "action"], ["state_action_cost"])
+    # Costs are not negative: an actor would exploit a critic that promised less than none.
+    costs = _ActionValue(nn.Sequential(network, nn.Softplus()))
+    return TensorDictModule(costs, ["observation", "action"], ["state_action_cost"])

@@ -20,7 +20,7 @@ class TrainingSettings:
 
     warmup_frames: int = 1000
     update_ratio: float = 0.5
-    log_interval: int = 500
+    log_interval: int = 400
 
     def __post_init__(self) -> None:
         _require(self.warmup_frames >= 0, "training.warmup_frames", ">= 0", self.warmup_frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import closing
 from typing import Any
 
 import hydra
@@ -22,6 +23,7 @@ from cnfp_torchrl.training.evaluation import Evaluation, evaluate
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings
+from cnfp_torchrl.training.watching import RECORDING, TrainingWatcher, Unwatched, Watch
 
 
 def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
@@ -38,6 +40,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     settings: TrainingSettings = instantiate(config.training)
     judgement: EvaluationSettings = instantiate(config.evaluation)
     score = instantiate(config.env.get("score"))
+    watch: Watch | None = instantiate(config.visual, _convert_="all") or None
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.threads)
 
@@ -59,9 +62,15 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
     kept += [key for key in [("next", "cost")] if key in loss.in_keys]
 
+    watcher: TrainingWatcher = Unwatched()
+    if watch is not None:
+        watcher = watch.of_training(folder.path / RECORDING, actor, env)
     folder.save_config(config)
+    loggers = [
+        make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()
+    ]
     metrics = Metrics(
-        [make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()],
+        [*loggers, *watcher.loggers],
         counted_constraints(env),
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
@@ -76,17 +85,19 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         return losses
 
     owed = 0.0
-    for collected in collector:
-        batch = collected.reshape(-1)
-        metrics.add_steps(batch)
-        buffer.extend(batch.select(*kept))
-        if metrics.frames >= settings.warmup_frames:
-            owed += batch.numel() * settings.update_ratio
-            while owed >= 1:
-                metrics.add_losses(update())
-                owed -= 1
-        metrics.log_if_due()
-    metrics.close()
+    with closing(watcher):
+        for collected in collector:
+            watcher.see(collected)
+            batch = collected.reshape(-1)
+            metrics.add_steps(batch)
+            buffer.extend(batch.select(*kept))
+            if metrics.frames >= settings.warmup_frames:
+                owed += batch.numel() * settings.update_ratio
+                while owed >= 1:
+                    metrics.add_losses(update())
+                    owed -= 1
+            metrics.log_if_due()
+        metrics.finish()
     collector.shutdown()
     folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
 

@@ -18,7 +18,9 @@ from cnfp_torchrl.visual.colours import INK, MUTED, constraint_colours
 Curve: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Steps and values."""
 
-RETURN, SPEED, VIOLATIONS = "train/return", "train/steps_per_second", "violations/"
+RETURN, VIOLATIONS = "train/return", "violations/"
+TIMES = ("train/steps_per_second", "train/seconds", "train/processor_seconds")
+"""Of the machine, not of learning: not drawn."""
 
 _WORDS = {"qvalue": "critic", "alpha": "α"}
 _TITLES = {"alpha": "entropy coefficient α", "entropy": "policy entropy (nats)"}
@@ -73,7 +75,7 @@ def learning_curves(
     others = {
         name: curve
         for name, curve in curves.items()
-        if name not in (RETURN, SPEED) and not name.startswith(VIOLATIONS)
+        if name not in (RETURN, *TIMES) and not name.startswith(VIOLATIONS)
     }
     panels = 2 + len(others)
     rows = -(-panels // _COLUMNS)

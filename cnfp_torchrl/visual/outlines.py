@@ -24,7 +24,7 @@ _FAR = 1e4
 """A set without an end in some direction is drawn up to here, well beyond any view."""
 
 
-def set_outline(each: ConstraintSet, view: View) -> list[Line]:
+def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> list[Line]:
     """Return the boundary of a set of actions in the plane, where its slack is zero.
 
     Works wherever the set lies, also for one that was dropped and has no point in common with the
@@ -33,10 +33,11 @@ def set_outline(each: ConstraintSet, view: View) -> list[Line]:
     Args:
         each: one set, of batch shape ``()`` and dimension 2.
         view: outside of it nothing is drawn.
+        nodes: of the grid along each axis; None takes as many as a figure needs.
     """
     x_low, x_high, y_low, y_high = view
-    x = torch.linspace(x_low, x_high, _GRID, dtype=torch.float64)
-    y = torch.linspace(y_low, y_high, _GRID, dtype=torch.float64)
+    x = torch.linspace(x_low, x_high, nodes or _GRID, dtype=torch.float64)
+    y = torch.linspace(y_low, y_high, nodes or _GRID, dtype=torch.float64)
     actions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     slack = each.with_fields(lambda value, _: value.double()).slack(actions)
     # A slack may be infinite; a contour needs numbers on both sides of it.

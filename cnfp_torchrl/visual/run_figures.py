@@ -65,6 +65,8 @@ def _figures(folder: RunFolder, config: DictConfig) -> dict[str, Figure]:
     layout = layout_of(env)
     if layout is not None:
         figures["trajectories"] = _trajectories(config, actor, colours)
+    if not head.flow.has_density:
+        return figures  # the stages of a flow are drawn with their densities
     for kind, state in zip(("permissive", "restrictive"), telling_states(env, head), strict=True):
         snapshot = take_snapshot(actor, state, seed=config.seed)
         if kind == "restrictive":

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.geometry import ConstraintSet, Region
-from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
+from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,12 @@ class FlowSnapshot:
         stages: in order of application.
         region: sets (``sets[0]`` the action bounds), centre and active flags of this state.
         constraint_names: of ``region.sets[1:]``, in order of application.
-        is_exact: whether the flow drops what cannot hold and keeps everything else.
         through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
+        flow: how the sets are combined.
         followed: index of the sample whose path through the stages is drawn.
+        is_recovered: whether the path of an executed action is known; an action outside the flow's
+            support, which another policy may have taken, has none and seems to stand still.
     """
 
     state: TensorDictBase
@@ -63,9 +68,15 @@ class FlowSnapshot:
     stages: tuple[Stage, ...]
     region: Region
     constraint_names: tuple[str, ...]
-    is_exact: bool
     through_stages: Callable[[Tensor], tuple[Tensor, Tensor]]
+    flow: Flow
     followed: int = 0
+    is_recovered: bool = True
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the flow drops what cannot hold and keeps everything else."""
+        return self.flow.is_exact
 
     @property
     def dim(self) -> int:
@@ -135,41 +146,77 @@ def take_snapshot(
         raise ValueError(
             f"state: expected one state (batch size ()), given {tuple(state.batch_size)}; index it"
         )
-    head = flow_head(actor)
     # The actor's own sampling must not advance the generator of a training run that goes on.
     with torch.random.fork_rng(devices=[]):
         state = actor(state.clone())
-    distribution = head.get_dist(state)
-    loc, scale = (state.get(key) for key in head.parameter_keys)
+    head = flow_head(actor)
+    loc = state.get(head.parameter_keys[0])
     generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(samples, loc.shape[-1], generator=generator).to(loc)
-    latents = loc + scale * noise
+    noise = torch.randn(samples, loc.shape[-1], generator=generator)
+    return snapshot_of(head, state, noise)
 
+
+def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tensor) -> FlowSnapshot:
+    """Return the snapshot of a state in which a policy has written its Gaussian.
+
+    Args:
+        head: the flow module of the policy.
+        state: of batch size ``()``, with location, scale and geometry; where centre and active
+            flags are missing, which only exact flows need, they are computed here.
+        noise: standard Gaussian, ``(n, d)``.
+    """
+    loc, scale = (state.get(key) for key in head.parameter_keys)
+    base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+    region = _region(head, state)
+    applied = _applied(head.stage_names, head.order)
+    bijector = stage_bijector(head.flow, region, applied[-1][1])
+
+    @torch.no_grad()
     def through_stages(latents: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.no_grad():
-            given = latents.to(loc)
-            actions, log_dets = distribution.stages(given)
-            log_density = distribution.base_dist.log_prob(given) - log_dets
-        return actions.cpu(), log_density.cpu()
+        given = latents.to(loc)
+        actions, log_dets = bijector.stages(given)
+        return actions.cpu(), (base.log_prob(given) - log_dets).cpu()
 
-    region = _on_host(head.get_region(state))
+    latents = loc + scale * noise.to(loc)
     actions, log_density = through_stages(latents)
+    on_host = _on_host(region)
     stages = tuple(
-        Stage(name, actions[i], log_density[i], applied, _is_active(region, applied[-1]))
-        for i, (name, applied) in enumerate(_applied(head.stage_names, head.order))
+        Stage(name, actions[i], log_density[i], sets, _is_active(on_host, sets[-1]))
+        for i, (name, sets) in enumerate(applied)
     )
     return FlowSnapshot(
-        state=state.cpu(),
+        state=state if loc.device.type == "cpu" else state.cpu(),
         loc=loc.cpu(),
         scale=scale.cpu(),
         latents=latents.cpu(),
-        latent_log_density=distribution.base_dist.log_prob(latents).cpu(),
+        latent_log_density=base.log_prob(latents).cpu(),
         stages=stages,
-        region=region,
+        region=on_host,
         constraint_names=tuple(head.order),
-        is_exact=head.flow.is_exact,
         through_stages=through_stages,
+        flow=head.flow,
     )
+
+
+def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Bijector:
+    """Return the bijector of a flow up to a stage.
+
+    Args:
+        flow: how the sets are combined.
+        region: of one state.
+        applied: indices into the region's sets of those applied so far.
+    """
+    constraints = [k for k in applied if k > 0]
+    sets = [region.sets[k] for k in constraints]
+    active = None if region.active is None else region.active[..., [0, *constraints]]
+    return flow(region.bounds, sets, region.centre, active)
+
+
+def _region(head: ConstrainedFlowModule, state: TensorDictBase) -> Region:
+    """Return the region of a state, whose centre only exact flows make the environment find."""
+    if state.get(CENTRE_KEY, None) is not None:
+        return head.get_region(state)
+    return Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
 
 
 def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, ...]]]:

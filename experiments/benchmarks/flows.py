@@ -3,10 +3,11 @@
 `python experiments/benchmarks/flows.py [--quick] [--output FOLDER]` measures, on one thread, the
 time of drawing reparametrised actions with their log-densities, and of that plus the backward pass,
 for every batch size, dimension and number of constraints, and writes ratios to TanhNormal measured
-in the same run. Distributions, regions and sets are constructed within the measured time, as an
-actor does at each call. Compared are the exact flow, eager and compiled; a radial squash whose
-log-determinant comes from the full Jacobian; and projections of the tanh-squashed sample, which
-have no density, by Dykstra's algorithm and by a cvxpylayers program (if it is installed).
+in the same run. Distributions are constructed once, outside of the measured time, and in further
+columns anew within it, as an actor does at each call. Compared are the exact flow, eager and
+compiled; a radial squash whose log-determinant comes from the full Jacobian; and projections of the
+tanh-squashed sample, which have no density, by Dykstra's algorithm and by a cvxpylayers program
+(`pip install 'cnfp_torchrl[bench]'`; at the smaller batch size).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -33,6 +35,7 @@ from cnfp_torchrl.bijectors import GaugeSquash, RadialSquash
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
+ROUNDS = 11
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 Sample = tuple[Tensor, ...]
 
@@ -86,16 +89,14 @@ class Problem:
         return Region((bounds, *sets), self.centre, self.active, validate_args=False)
 
 
-def tanh_normal(p: Problem) -> Sample:
-    """TorchRL's distribution, which knows the action bounds only."""
-    return TanhNormal(p.loc, p.scale, low=p.low, high=p.high).rsample_and_log_prob()
+def tanh_normal(p: Problem) -> TanhNormal:
+    """Return TorchRL's distribution, which knows the action bounds only."""
+    return TanhNormal(p.loc, p.scale, low=p.low, high=p.high)
 
 
-def exact(p: Problem) -> Sample:
-    """Return a sample of the exact flow."""
-    return ConstrainedFlow(
-        p.base(), GaugeSquash(p.region(), validate_args=False)
-    ).rsample_and_log_prob()
+def exact_flow(p: Problem) -> ConstrainedFlow:
+    """Return the exact flow."""
+    return ConstrainedFlow(p.base(), GaugeSquash(p.region(), validate_args=False))
 
 
 def radial_full_jacobian(p: Problem) -> Sample:
@@ -118,7 +119,7 @@ def radial_full_jacobian(p: Problem) -> Sample:
 
 def dykstra(p: Problem, iterations: int = 50) -> Sample:
     """Return the tanh-squashed sample projected onto the intersection; it has no density."""
-    action = tanh_normal(p)[0]
+    action = tanh_normal(p).rsample_and_log_prob()[0]
     corrections = [torch.zeros_like(action) for _ in range(1 + len(p.balls) + len(p.boxes))]
     for _ in range(iterations):
         for k, correction in enumerate(corrections):
@@ -155,46 +156,70 @@ def cvxpy_projection(p: Problem) -> Callable[[], Sample]:
     layer = CvxpyLayer(program, parameters=[wish, *centers, *radii, *flat], variables=[action])
     values = [m for m, _ in p.balls] + [r for _, r in p.balls]
     values += [side for pair in p.boxes for side in pair]
-    return lambda: (layer(tanh_normal(p)[0], *values)[0],)
+    return lambda: (layer(tanh_normal(p).rsample_and_log_prob()[0], *values)[0],)
 
 
-def milliseconds(call: Callable[[], Any], seconds: float) -> float:
-    """Return the median time of a call."""
-    call()
-    timer = Timer("call()", globals={"call": call}, num_threads=1)
-    return timer.blocked_autorange(min_run_time=seconds).median * 1e3
+def milliseconds(calls: dict[str, Callable[[], Any]], seconds: float) -> dict[str, list[float]]:
+    """Return the time of each call in each of several rounds.
+
+    In a round all calls take their turn, so that another program's load falls on all of them.
+    """
+    timers = {name: Timer("call()", globals={"call": call}) for name, call in calls.items()}
+    single = {name: timer.timeit(3).mean for name, timer in timers.items()}
+    count = {name: max(1, round(seconds / ROUNDS / time)) for name, time in single.items()}
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(ROUNDS):
+        for name, timer in timers.items():
+            times[name].append(timer.timeit(count[name]).mean * 1e3)
+    return times
 
 
 def measure(batch: int, dim: int, constraints: int, *, quick: bool) -> dict[str, Any]:
     """Return forward and forward-plus-backward times of each method on one problem."""
     p = Problem.random(batch, dim, constraints)
+    tanh, exact = tanh_normal(p), exact_flow(p)
     calls: dict[str, Callable[[], Sample]] = {
-        "TanhNormal": lambda: tanh_normal(p),
-        "exact": lambda: exact(p),
+        "TanhNormal": lambda: tanh.rsample_and_log_prob(),
+        "exact": lambda: exact.rsample_and_log_prob(),
+        "TanhNormal, constructed": lambda: tanh_normal(p).rsample_and_log_prob(),
+        "exact, constructed": lambda: exact_flow(p).rsample_and_log_prob(),
         "Dykstra, 50 rounds": lambda: dykstra(p),
     }
     if batch * dim <= 4096:
         calls["radial, full Jacobian"] = lambda: radial_full_jacobian(p)
     if not quick:
-        compiled, compiled_tanh = torch.compile(exact), torch.compile(tanh_normal)
-        calls["exact, compiled"] = lambda: compiled(p)
-        calls["TanhNormal, compiled"] = lambda: compiled_tanh(p)
+        for name in ("TanhNormal", "exact", "TanhNormal, constructed", "exact, constructed"):
+            calls[f"{name}, compiled"] = torch.compile(calls[name])
         if find_spec("cvxpylayers") and batch <= 256:
             calls["cvxpylayers"] = cvxpy_projection(p)
-    seconds = 0.02 if quick else 0.5
+
+    def with_backward(call: Callable[[], Sample]) -> Callable[[], None]:
+        return lambda: torch.stack([part.sum() for part in call()]).sum().backward()
+
     row: dict[str, Any] = {"batch": batch, "dim": dim, "constraints": constraints}
-    for name, call in calls.items():
-
-        def both(call: Callable[[], Sample] = call) -> None:
-            torch.stack([part.sum() for part in call()]).sum().backward()
-
-        row[name] = {"sample": milliseconds(call, seconds), "backward": milliseconds(both, seconds)}
-        torch.compiler.reset()
+    seconds = 0.02 if quick else 0.5
+    sample = milliseconds(calls, seconds)
+    backward = milliseconds({name: with_backward(call) for name, call in calls.items()}, seconds)
+    for name in calls:
+        row[name] = {
+            part: {"ms": median(times[name]), "ratio": _ratio(times[name], times[_reference(name)])}
+            for part, times in (("sample", sample), ("backward", backward))
+        }
+    torch.compiler.reset()
     return row
 
 
+def _reference(name: str) -> str:
+    """Return the TanhNormal that is constructed and compiled alike."""
+    return name.replace("exact", "TanhNormal") if name.startswith("exact") else "TanhNormal"
+
+
+def _ratio(times: list[float], reference: list[float]) -> float:
+    return median(time / other for time, other in zip(times, reference, strict=True))
+
+
 def table(rows: list[dict[str, Any]], part: str) -> str:
-    """Return ratios to TanhNormal, the compiled flow's to the compiled TanhNormal, as Markdown."""
+    """Return ratios to the TanhNormal that is constructed and compiled alike, as Markdown."""
     methods = dict.fromkeys(n for row in rows for n in row if isinstance(row[n], dict))
     names = [n for n in methods if not n.startswith("TanhNormal")]
     lines = [
@@ -204,11 +229,10 @@ def table(rows: list[dict[str, Any]], part: str) -> str:
     for row in rows:
         cells = []
         for name in names:
-            against = "TanhNormal, compiled" if name.endswith("compiled") else "TanhNormal"
-            ratio = row[name][part] / row[against][part] if name in row else None
+            ratio = row[name][part]["ratio"] if name in row else None
             cells.append("" if ratio is None else f"{ratio:.2f}" if ratio < 100 else f"{ratio:.0f}")
         head = [str(row[key]) for key in ("batch", "dim", "constraints")]
-        cells = [*head, f"{row['TanhNormal'][part]:.3f}", *cells]
+        cells = [*head, f"{row['TanhNormal'][part]['ms']:.3f}", *cells]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -248,7 +272,8 @@ def main() -> None:
             "",
             f"One thread, {about}.",
             "",
-            "Compiled flows are compared with the compiled TanhNormal.",
+            "Compared with a TanhNormal that is constructed and compiled alike: once, or anew at "
+            "each call where it says constructed. Medians of rounds in which all take turns.",
             "",
             "## Drawing an action and its log-density",
             "",

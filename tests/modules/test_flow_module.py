@@ -13,11 +13,19 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cnfp_torchrl.bijectors import BijectorChain, BoxSquash, GaugeSquash, RadialSquash
+from cnfp_torchrl.bijectors import (
+    BijectorChain,
+    BoxSquash,
+    GaugeSquash,
+    NoDensityError,
+    Projection,
+    RadialSquash,
+)
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     Flow,
     PaperChain,
+    ProjectionFlow,
     constrain,
     flow_head,
     make_constrained_actor,
@@ -27,6 +35,7 @@ from cnfp_torchrl.modules.flow_module import action_bounds
 
 FLOWS = ["exact", "radial", "squash", "none"]
 EXACT_FLOWS = ["exact", "radial"]
+SAFE_FLOWS = [*EXACT_FLOWS, "projection"]  # the last without a density
 EXPLORATION_TYPES = [
     ExplorationType.RANDOM,
     ExplorationType.DETERMINISTIC,
@@ -74,6 +83,7 @@ def doubled(tensordict: TensorDictBase) -> TensorDictBase:
     [
         ("exact", {"center", "radius", "low", "high", "active", "centre"}),
         ("radial", {"center", "radius", "low", "high", "active", "centre"}),
+        ("projection", {"center", "radius", "low", "high", "active", "centre"}),
         ("squash", {"center", "radius", "low", "high"}),
         ("none", set()),
     ],
@@ -106,11 +116,12 @@ def test_each_missing_entry_is_named(
     [
         ("exact", GaugeSquash),
         ("radial", RadialSquash),
+        ("projection", Projection),
         ("squash", BijectorChain),
         ("none", BoxSquash),
         (PaperChain(max_radius=0.5), BijectorChain),
     ],
-    ids=["exact", "radial", "squash", "none", "object"],
+    ids=["exact", "radial", "projection", "squash", "none", "object"],
 )
 def test_flows_by_name_and_as_objects(
     make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type
@@ -121,7 +132,8 @@ def test_flows_by_name_and_as_objects(
 
 
 def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
-    message = re.escape(f"flow: expected one of {FLOWS} or a Flow, given 'gauge'")
+    names = ["exact", "radial", "squash", "projection", "none"]
+    message = re.escape(f"flow: expected one of {names} or a Flow, given 'gauge'")
     with pytest.raises(ValueError, match=message):
         make_actor(flow="gauge")
 
@@ -132,12 +144,18 @@ def test_the_paper_chain_needs_a_radius(radius: float) -> None:
         PaperChain(max_radius=radius)
 
 
+@pytest.mark.parametrize("rounds", [0, -3])
+def test_the_projection_needs_rounds(rounds: int) -> None:
+    with pytest.raises(ValueError, match="rounds: expected a number >= 1, given"):
+        ProjectionFlow(rounds=rounds)
+
+
 # What it draws ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("exploration", EXPLORATION_TYPES, ids=lambda mode: mode.name)
 @pytest.mark.parametrize("latent", LATENTS.values(), ids=LATENTS)
-@pytest.mark.parametrize("flow", EXACT_FLOWS)
+@pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_exact_flows_stay_inside_whatever_the_network(
     make_actor: MakeActor,
     state: TensorDictBase,
@@ -176,7 +194,7 @@ def test_the_other_flows_keep_what_they_promise_and_no_more(
     assert not results[broken].all(), "the states bind nothing: the tests above show little"
 
 
-@pytest.mark.parametrize("flow", EXACT_FLOWS)
+@pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_a_constraint_that_cannot_hold_leaves_the_others(
     env: TransformedEnv, make_actor: MakeActor, inside: Inside, flow: str
 ) -> None:
@@ -284,6 +302,31 @@ def test_a_tensordict_for_the_output(make_actor: MakeActor, state: TensorDictBas
     assert "action" not in state.keys()  # noqa: SIM118 - a tensordict iterates over its batch
 
 
+def test_the_projection_has_no_log_prob(make_actor: MakeActor, state: TensorDictBase) -> None:
+    with pytest.raises(ValueError, match="return_log_prob: expected False for ProjectionFlow"):
+        make_actor(flow="projection", return_log_prob=True)
+    actor = make_actor(flow="projection")
+    with pytest.raises(NoDensityError, match="it has no density"):
+        actor.get_dist(actor(state)).log_prob(state["action"])
+
+
+def test_the_projection_agrees_with_tanh_where_nothing_binds(
+    make_actor: MakeActor, state: TensorDictBase
+) -> None:
+    torch.manual_seed(1)
+    projected = make_actor(flow="projection")(state.clone())["action"]
+    torch.manual_seed(1)
+    plain = make_actor(flow="none")(state.clone())
+    allowed = flow_head(make_actor()).get_region(state).slack(plain["action"]) > 1e-4
+    assert allowed.any()
+    assert not allowed.all()
+    torch.testing.assert_close(projected[allowed], plain["action"][allowed], rtol=0, atol=1e-5)
+    moved = (projected - plain["action"]).norm(dim=-1)
+    exact = make_actor(flow="exact")
+    torch.manual_seed(1)
+    assert (moved <= (exact(state.clone())["action"] - plain["action"]).norm(dim=-1) + 1e-4).all()
+
+
 # Copies, devices, dtypes, compilation -------------------------------------------------------------
 
 
@@ -337,7 +380,7 @@ def test_float64_all_the_way(make_actor: MakeActor, state: TensorDictBase, flow:
     torch.testing.assert_close(double["action"].float(), single, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("flow", EXACT_FLOWS)
+@pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_float64_actions_on_float32_geometry_survive_the_cast(
     make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str
 ) -> None:

@@ -1,4 +1,4 @@
-"""No network breaks a constraint behind an exact flow: a small run, and the kept result of a large.
+"""No network breaks a constraint behind a safe flow: a small run, and the kept result of a large.
 
 The large one is `experiments/hostile_networks.py`.
 """
@@ -74,7 +74,7 @@ def test_the_command_writes_both_files_and_fails_on_violations(
     monkeypatch.setattr(experiment, "NETWORKS", {"untrained, default": None})
     experiment.main()
     kept = json.loads(output.read_text())
-    assert [row["flow"] for row in kept["rows"]] == ["exact", "radial"]
+    assert [row["flow"] for row in kept["rows"]] == ["exact", "radial", "projection"]
     assert kept["versions"]["torch"] == torch.__version__
     assert "--steps 400 --agents 200 --seed 0" in kept["command"]
     assert output.with_suffix(".md").read_text().count("| untrained, default | 400 | 0 | 0 |") == 2

@@ -14,7 +14,8 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from cnfp_torchrl.modules import flow_head, with_reference_entropy
-from cnfp_torchrl.objectives import ConstrainedSACLoss
+from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
+from cnfp_torchrl.training.networks import action_cost_network
 
 MakeActor = Callable[..., Any]
 
@@ -152,6 +153,43 @@ def test_vmap_changes_nothing(
         results.append(evaluated(loss, transitions))
     for name, value in results[0].items():
         torch.testing.assert_close(results[1][name], value, msg=name)
+
+
+# Projected actions, which have no density --------------------------------------------------------
+
+
+def test_projected_actions_learn_by_the_reference_entropy(
+    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, transitions: TensorDictBase
+) -> None:
+    actor = make_actor(flow="projection")
+    losses = ConstrainedSACLoss(actor, critic, action_spec=env.action_spec_unbatched)(transitions)
+    total(losses).backward()
+    for parameter in actor.parameters():
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().sum() > 0
+    # The entropy rewarded is that of the tanh-squashed Gaussian, whatever is projected.
+    state = actor(transitions.clone())
+    projected = flow_head(with_reference_entropy(actor)).get_dist(state)
+    unprojected = flow_head(make_actor(flow="none")).get_dist(state)
+    torch.manual_seed(1)
+    expected = unprojected.rsample_and_log_prob()[1]
+    torch.manual_seed(1)
+    torch.testing.assert_close(projected.rsample_and_log_prob()[1], expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("lagrangian", [False, True], ids=["sac", "lagrangian"])
+def test_the_entropy_of_projected_actions_is_refused(
+    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, lagrangian: bool
+) -> None:
+    networks = [make_actor(flow="projection"), critic]
+    options: dict[str, Any] = {"entropy": "action", "action_spec": env.action_spec_unbatched}
+    make_loss: type[SACLoss] = ConstrainedSACLoss
+    if lagrangian:
+        make_loss = SACLagrangianLoss
+        networks.append(action_cost_network(5, 2, 2, hidden=[8]))
+        options["thresholds"] = [0.0, 0.0]
+    with pytest.raises(ValueError, match=r"entropy: expected 'reference' .* given 'action'"):
+        make_loss(*networks, **options)
 
 
 # The two entropies --------------------------------------------------------------------------------

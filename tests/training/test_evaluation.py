@@ -54,6 +54,19 @@ def test_a_gymnasium_environment_is_evaluated_too() -> None:
     assert (result.returns < 0).all()
 
 
+def test_returns_that_are_not_finite_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = PointNavEnv._step
+
+    def broken_step(self: PointNavEnv, tensordict: Any) -> Any:
+        result = step(self, tensordict)
+        result["reward"][1] = torch.nan
+        return result
+
+    monkeypatch.setattr(PointNavEnv, "_step", broken_step)
+    with pytest.raises(FloatingPointError, match="those of 1 of 3 episodes are not"):
+        evaluate(PointNavEnv((3,), seed=0, max_steps=5), STILL, episodes=3)
+
+
 def test_an_endless_episode_is_named() -> None:
     with pytest.raises(RuntimeError, match="truncate the environment"):
         evaluate(PointNavEnv((2,), seed=0), STILL, episodes=2, max_steps=10)

@@ -1,3 +1,4 @@
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -22,8 +23,13 @@ def form(value: Any) -> Any:
     return type(value).__name__
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
-@pytest.mark.parametrize("entropy", ["reference", "action"])
+ENTROPIES = [
+    *itertools.product(["exact", "radial", "squash", "none"], ["reference", "action"]),
+    ("projection", "reference"),
+]
+
+
+@pytest.mark.parametrize(("flow", "entropy"), ENTROPIES)
 def test_every_flow_trains_and_reports_in_one_form(flow: str, entropy: str, tiny_run: Run) -> None:
     folder, summary = tiny_run(f"flow={flow}", f"loss.entropy={entropy}")
     _, reference = tiny_run()
@@ -31,7 +37,7 @@ def test_every_flow_trains_and_reports_in_one_form(flow: str, entropy: str, tiny
     assert json.loads((folder.path / "summary.json").read_text()) == summary
     assert summary["steps"] == 192
     assert list(summary["violations"]) == ["obstacle", "battery"]
-    if flow in ("exact", "radial"):
+    if flow in ("exact", "radial", "projection"):
         assert summary["violations"] == {"obstacle": 0, "battery": 0}
 
 

@@ -1,0 +1,108 @@
+"""What a flow policy did in a recorded step: the executed action's way through the stages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.distributions import Independent, Normal
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.bijectors import BijectorChain
+from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.modules.constraint_bijector import require
+from cnfp_torchrl.visual.snapshot import FlowSnapshot, Stage, snapshot_of, stage_bijector
+
+
+@torch.no_grad()
+def replay_step(
+    actor: SafeProbabilisticTensorDictSequential, transition: TensorDictBase, noise: Tensor
+) -> FlowSnapshot:
+    """Return what a constrained actor did in one recorded step; sample 0 is the executed action.
+
+    The Gaussian is the recorded one where the policy wrote it: in a warm-up it is not the
+    network's. The way of the executed action is found by inverting the flow in float64, whose sets
+    are eroded less than those of float32, so that saturated actions have a latent, too. After the
+    last stage stands the recorded action, bit by bit.
+
+    Args:
+        actor: from `make_constrained_actor` or `constrain`.
+        transition: of batch size ``()``, with geometry and action; not changed.
+        noise: standard Gaussian, ``(n, d)``, for the other samples.
+
+    Raises:
+        ValueError: when the transition is a batch.
+        MissingGeometryError: when the action or geometry is missing.
+    """
+    if transition.batch_size != torch.Size():
+        raise ValueError(
+            "transition: expected one step (batch size ()), given "
+            f"{tuple(transition.batch_size)}; index it"
+        )
+    head = flow_head(actor)
+    state = transition.exclude("next")
+    action = require(state, head.action_key, "replay steps that a policy has taken").detach()
+    if any(state.get(key, None) is None for key in head.parameter_keys):
+        # Drawing an action must not advance the generator of a training run that goes on.
+        with torch.random.fork_rng(devices=[]):
+            state = actor(state.clone()).set(head.action_key, action)
+    return _with_executed(snapshot_of(head, state, noise), action.cpu())
+
+
+def in_float64(region: Region) -> Region:
+    """Return a region in float64."""
+    sets = tuple(each.with_fields(lambda value, _: value.double()) for each in region.sets)
+    return Region(sets, region.centre.double(), region.active, validate_args=False)
+
+
+def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
+    """Return the snapshot with the executed action before all samples."""
+    region, last = in_float64(snapshot.region), snapshot.stages[-1]
+    bijector = stage_bijector(snapshot.flow, region, last.applied)
+    given = action.double()
+    latent = bijector.inverse_and_log_det(given)[0]
+    path, log_dets = bijector.stages(latent)
+    if isinstance(bijector, BijectorChain):
+        path = _backwards(bijector, given)
+    normal = Normal(snapshot.loc.double(), snapshot.scale.double(), validate_args=False)
+    latent_log_density = Independent(normal, 1, validate_args=False).log_prob(latent)
+    log_density = latent_log_density - log_dets
+    is_recovered = bool(path.isfinite().all())
+    if not is_recovered:
+        path = given.expand(len(snapshot.stages), -1)
+    stages = tuple(
+        Stage(
+            stage.name,
+            _before(action if stage is last else path[i], stage.samples),
+            _before(log_density[i], stage.log_density),
+            stage.applied,
+            stage.active,
+        )
+        for i, stage in enumerate(snapshot.stages)
+    )
+    return replace(
+        snapshot,
+        latents=_before(latent, snapshot.latents),
+        latent_log_density=_before(latent_log_density, snapshot.latent_log_density),
+        stages=stages,
+        is_recovered=is_recovered,
+    )
+
+
+def _backwards(chain: BijectorChain, action: Tensor) -> Tensor:
+    """Return where an action was after each member of a chain, without passing through the latent.
+
+    A squash before the last one may be saturated, where the latent is lost to rounding but the
+    actions in between are not.
+    """
+    points = [action]
+    for member in reversed(chain.bijectors[1:]):
+        points.append(member.inverse_and_log_det(points[-1])[0])
+    return torch.stack(points[::-1])
+
+
+def _before(first: Tensor, rest: Tensor) -> Tensor:
+    return torch.cat([first.to(rest).unsqueeze(0), rest])

@@ -1,0 +1,185 @@
+"""Time the stream to Rerun: `python experiments/benchmarks/stream.py [--quick] [--output FOLDER]`.
+
+Measures processor time, of all threads, with everything written to a file: each step of an
+evaluation in full detail, and a training step of which each tenth is logged. Without a stream
+nothing of it is called, so that there is nothing to measure; that Rerun is not even imported then
+is measured instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.visual.stream import FlowStream, flow_blueprint
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+EVERY = 10
+GOALS_MS = {"evaluation, each step": 10.0, f"training, every {EVERY}th step": 1.5}
+
+_WHAT_IS_IMPORTED = (
+    "import sys, cnfp_torchrl.visual, cnfp_torchrl.training.train; print('rerun' in sys.modules)"
+)
+
+
+class StandardNormal(nn.Module):
+    """The base of a network that has learned nothing yet, at almost no cost."""
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location 0 and scale 1."""
+        shape = (*observation.shape[:-1], 2)
+        return torch.zeros(shape), torch.ones(shape)
+
+
+def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
+    """Return point navigation with K = 2 constraints, and an actor for it."""
+    env = make_environment(
+        PointNavEnv([1], seed=0),
+        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
+        order=["battery", "obstacle"],
+        with_centre=True,
+    )
+    actor = make_constrained_actor(
+        StandardNormal(), env.action_spec_unbatched, constraint_bijectors(env)
+    )
+    return env, actor
+
+
+def processor_time(
+    env: TransformedEnv,
+    actor: SafeProbabilisticTensorDictSequential,
+    steps: Sequence[TensorDictBase],
+    every: int,
+) -> tuple[float, float]:
+    """Return milliseconds of processor time and bytes of the file, for each step.
+
+    Args:
+        env: of point navigation.
+        actor: its policy.
+        steps: transitions of batch size ``()``; the first tenth warms up.
+        every: see `FlowStream`.
+    """
+    warm_up = len(steps) // 10
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording.rrd"
+        recording = rr.RecordingStream("benchmark")
+        recording.set_sinks(rr.FileSink(path), default_blueprint=flow_blueprint(actor, env))
+        stream = FlowStream(recording, actor, env, every=every)
+        for step in range(warm_up):
+            stream.log_step(step, steps[step])
+        recording.flush(timeout_sec=30)
+        size, start = path.stat().st_size, time.process_time()
+        for step in range(warm_up, len(steps)):
+            stream.log_step(step, steps[step])
+        recording.flush(timeout_sec=30)
+        taken = time.process_time() - start
+        size = path.stat().st_size - size
+        recording.disconnect()
+    measured = len(steps) - warm_up
+    return 1000 * taken / measured, size / measured
+
+
+def reference() -> float:
+    """Return the milliseconds of a fixed piece of work, which tell how busy the machine is."""
+    start = time.process_time()
+    torch.randn(2000, 200, generator=torch.Generator().manual_seed(0)).cumsum(0).exp().sum()
+    for _ in range(1_000_000):
+        pass
+    return 1000 * (time.process_time() - start)
+
+
+def table(rows: dict[str, dict[str, Any]], setting: dict[str, Any]) -> str:
+    """Return the results as Markdown."""
+    lines = [
+        "# What the stream to Rerun costs",
+        "",
+        "`python experiments/benchmarks/stream.py`",
+        "",
+        "Processor time of all threads for a step of point navigation (K = 2, 512 samples, three "
+        "stages, densities on 40 x 40 cells), written to a file; median and range of "
+        f"{setting['repeats']} repeats of {setting['steps']} steps. One thread of PyTorch "
+        f"{setting['torch']}, Rerun {setting['rerun']}, Python {setting['python']} on "
+        f"{setting['processor']}.",
+        "",
+        "| | ms a step | range | goal | bytes a step |",
+        "|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        low, high = min(row["ms"]), max(row["ms"])
+        lines.append(
+            f"| {name} | {statistics.median(row['ms']):.2f} | {low:.2f} to {high:.2f} | "
+            f"{GOALS_MS[name]} | {row['bytes']:.0f} |"
+        )
+    lines += [
+        "",
+        f"Without a stream, Rerun is imported: {setting['imported_when_off']}. On a busy machine a "
+        f"step costs more; a fixed piece of work beside it took {setting['reference_ms']} ms.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and write ``stream.json`` and ``stream.md``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few steps, to see that it works")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the results")
+    arguments = parser.parse_args()
+    steps, repeats = (20, 1) if arguments.quick else (500, 7)
+
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    env, actor = pipeline()
+    rollout = env.rollout(steps, actor, break_when_any_done=False)[0].unbind(0)
+    off = subprocess.run(
+        [sys.executable, "-c", _WHAT_IS_IMPORTED], check=True, capture_output=True, text=True
+    )
+    rows: dict[str, dict[str, Any]] = {name: {"ms": [], "bytes": 0.0} for name in GOALS_MS}
+    references = []
+    for _ in range(repeats):
+        for name, every in zip(rows, (1, EVERY), strict=True):
+            references.append(reference())
+            milliseconds, size = processor_time(env, actor, rollout, every)
+            rows[name]["ms"].append(milliseconds)
+            rows[name]["bytes"] = size
+    setting = {
+        "steps": steps,
+        "repeats": repeats,
+        "reference_ms": round(statistics.median(references), 2),
+        "imported_when_off": off.stdout.strip(),
+        "python": platform.python_version(),
+        "processor": platform.machine(),
+        "torch": version("torch"),
+        "rerun": version("rerun-sdk"),
+    }
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "stream.json").write_text(
+        json.dumps({"setting": setting, "rows": rows}, indent=2) + "\n"
+    )
+    text = table(rows, setting)
+    (arguments.output / "stream.md").write_text(text)
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The experiment of the paper: runs, kept data, statistics, figures and report."""

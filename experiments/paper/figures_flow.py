@@ -1,0 +1,242 @@
+"""The flow in three states: on the map, permissive and restrictive, from kept Gaussians.
+
+A network enters a picture of one state by nothing but the Gaussian that it puts there, so the few
+numbers of these are kept, and no checkpoint is needed to draw:
+
+    python -m experiments.paper.figures_flow RUN [--output experiments/paper/policy.json]
+
+reads them from the folder of a finished run of `experiment=exact`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.envs import (
+    BatteryGeometry,
+    Layout,
+    ObstacleGeometry,
+    PointNavEnv,
+    constraint_bijectors,
+)
+from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.environment import make_environment
+from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
+from cnfp_torchrl.visual import FlowSnapshot, flow_stages, take_snapshot
+from cnfp_torchrl.visual.banner import flow_banner
+from experiments.paper.fields import Fields
+
+KEPT = Path(__file__).parent / "policy.json"
+ORDER = ["battery", "obstacle"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A state of point navigation.
+
+    Args:
+        position: of the agent, in arena units.
+        battery: in percent.
+        goal: in arena units.
+    """
+
+    position: tuple[float, float]
+    battery: int
+    goal: tuple[float, float]
+
+
+PLACES = {
+    "flow": Place((0.34, -0.33), 28, (-0.55, 0.3)),
+    "permissive": Place((0.62, 0.62), 100, (0.5, 0.5)),
+    "restrictive": Place((-0.93, 0.19), 22, (0.5, 0.3)),
+}
+"""Chosen by hand: at a corner of the rectangle, far from everything, and between wall and station.
+
+In the first and the last the battery reaches a station and no farther, and the goal is elsewhere.
+"""
+
+
+@dataclass(frozen=True)
+class KeptPolicy:
+    """The Gaussians that a network puts into `PLACES`.
+
+    Args:
+        source: where they come from, in words.
+        gaussians: location and scale by the name of the place, ``(2,)`` each.
+    """
+
+    source: str
+    gaussians: dict[str, tuple[tuple[float, ...], tuple[float, ...]]]
+
+
+UNTRAINED = KeptPolicy(
+    "a standard normal, in place of a network: no trained policy is kept",
+    dict.fromkeys(PLACES, ((0.0, 0.0), (1.0, 1.0))),
+)
+
+
+class FixedGaussian(nn.Module):
+    """The same location and scale in every state.
+
+    Args:
+        loc: location, ``(d,)``.
+        scale: scale, ``(d,)``.
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        super().__init__()
+        self.loc, self.scale = loc, scale
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location and scale for observations ``(*batch, n)``."""
+        batch = observation.shape[:-1]
+        return self.loc.expand(*batch, -1), self.scale.expand(*batch, -1)
+
+
+def find_policy(path: Path, runs: Path) -> KeptPolicy:
+    """Return the kept policy; else keep that of a finished run; else `UNTRAINED`.
+
+    Args:
+        path: of the kept policy.
+        runs: folder of runs, ``exact/seed_S`` among them.
+
+    Raises:
+        ValueError: when what is there cannot be used, naming it.
+        OSError: when it cannot be read.
+    """
+    if path.is_file():
+        return load_policy(path)
+    for summary in sorted(runs.glob(f"exact/*/{SUMMARY}")):
+        policy = policy_of(RunFolder.open(summary.parent))
+        save_policy(policy, path)
+        return policy
+    return UNTRAINED
+
+
+def load_policy(path: Path) -> KeptPolicy:
+    """Read a kept policy.
+
+    Raises:
+        RecordError: when the file is not a kept policy of these places, naming the field.
+    """
+    fields = Fields.read(path)
+    source, parts = fields.text("source"), fields.parts("gaussians")
+    if sorted(parts) != sorted(PLACES):
+        raise fields.error("gaussians", f"expected {sorted(PLACES)}, given {sorted(parts)}")
+    fields.nothing_left()
+    gaussians = {}
+    for name, part in parts.items():
+        loc, scale = part.numbers("loc"), part.numbers("scale")
+        if len(loc) != 2 or len(scale) != 2 or min(scale) <= 0:
+            raise part.error("loc, scale", f"expected 2 and 2 > 0 numbers, given {loc}, {scale}")
+        part.nothing_left()
+        gaussians[name] = (tuple(loc), tuple(scale))
+    return KeptPolicy(source, gaussians)
+
+
+@torch.no_grad()
+def policy_of(folder: RunFolder) -> KeptPolicy:
+    """Return what a finished run's network puts into `PLACES`.
+
+    Raises:
+        ValueError: when the run is not one of an exact flow, for which the pictures are drawn.
+    """
+    config = folder.load_config()
+    env = build_environment(config, batch_size=[])
+    actor = load_actor(folder, config, env)
+    flow = flow_head(actor).flow
+    if not isinstance(flow, ExactFlow):
+        raise ValueError(
+            f"run: expected one of the exact flow, given {type(flow).__name__} in "
+            f"{folder.path}; train it with experiment=exact"
+        )
+    gaussians = {}
+    for name, place in PLACES.items():
+        state = actor(_reset(env, place))
+        loc, scale = state.get("loc"), state.get("scale")
+        gaussians[name] = (tuple(loc.tolist()), tuple(scale.tolist()))
+    source = (
+        f"the network of the exact flow, seed {config.seed}, after "
+        f"{config.collector.total_frames:,} training steps"
+    )
+    return KeptPolicy(source, gaussians)
+
+
+def save_policy(policy: KeptPolicy, path: Path) -> None:
+    """Write a kept policy."""
+    gaussians = {
+        name: {"loc": loc, "scale": scale} for name, (loc, scale) in policy.gaussians.items()
+    }
+    text = json.dumps({"source": policy.source, "gaussians": gaussians}, indent=1)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
+    """Return the flow on the map, and the permissive and the restrictive state."""
+    flow, permissive, restrictive = (snapshot(policy, name) for name in PLACES)
+    layout = Layout()
+    restrictive = restrictive.following_the_longest_path()
+    return {
+        "flow": flow_banner(flow, layout),
+        "permissive": flow_stages(
+            permissive, layout=layout, title=_title("Permissive", permissive)
+        ),
+        "restrictive": flow_stages(
+            restrictive, layout=layout, title=_title("Restrictive", restrictive)
+        ),
+    }
+
+
+def snapshot(policy: KeptPolicy, name: str) -> FlowSnapshot:
+    """Return the exact flow with the kept Gaussian of one of `PLACES`."""
+    env = make_environment(
+        PointNavEnv(seed=0),
+        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
+        order=ORDER,
+        with_centre=True,
+    )
+    loc, scale = (torch.tensor(each) for each in policy.gaussians[name])
+    actor: SafeProbabilisticTensorDictSequential = make_constrained_actor(
+        FixedGaussian(loc, scale),
+        env.action_spec_unbatched,
+        constraint_bijectors(env),
+        order=ORDER,
+    )
+    return take_snapshot(actor, _reset(env, PLACES[name]))
+
+
+def _reset(env: TransformedEnv, place: Place) -> TensorDictBase:
+    return env.reset(position=place.position, battery=place.battery, goal=place.goal)
+
+
+def _title(kind: str, drawn: FlowSnapshot) -> str:
+    return f"{kind} state: {100 * drawn.allowed_share():.0f} % of the actions are allowed"
+
+
+def main() -> None:
+    """Keep the Gaussians of a finished run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run of experiment=exact")
+    parser.add_argument("--output", type=Path, default=KEPT, help="the JSON file to write")
+    arguments = parser.parse_args()
+    try:
+        policy = policy_of(RunFolder.open(arguments.run))
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    save_policy(policy, arguments.output)
+
+
+if __name__ == "__main__":
+    main()

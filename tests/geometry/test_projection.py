@@ -1,0 +1,273 @@
+"""Euclidean projections against SciPy's solver, and what every projection must do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    Ellipsoid,
+    HalfSpaces,
+    Region,
+    WeightedL1Ball,
+    project,
+    project_onto_intersection,
+)
+
+
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def cube(dim: int, half: float = 1.0) -> Box:
+    return Box(torch.full((dim,), -half).double(), torch.full((dim,), half).double())
+
+
+TIP = Ball(tensor(1.5, 0.0), tensor(0.6).squeeze())
+"""Reaches 0.1 into the action bounds: the intersection is a thin slice with sharp ends."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """An intersection, and how exactly it is projected onto.
+
+    Args:
+        name: for the test's id.
+        sets: the first is the box of action bounds.
+        rounds: of Dykstra's algorithm.
+        error: the largest distance to SciPy's solution, which itself is good to 2e-6.
+    """
+
+    name: str
+    sets: tuple[ConstraintSet, ...]
+    rounds: int = 1
+    error: float = 2e-6
+
+    @property
+    def dim(self) -> int:
+        return self.sets[0].dim
+
+    def region(self, dtype: torch.dtype = torch.float64) -> Region:
+        sets = tuple(each.with_fields(lambda field, _: field.to(dtype)) for each in self.sets)
+        return Region(sets, torch.zeros(self.dim, dtype=dtype), validate_args=False)
+
+
+def random_ball(dim: int, seed: int) -> Ball:
+    generator = torch.Generator().manual_seed(seed)
+    way = torch.randn(dim, generator=generator, dtype=torch.float64)
+    return Ball(1.2 * way / way.norm(), tensor(0.9).squeeze())
+
+
+CASES = (
+    Case("bounds alone", (cube(3),)),
+    Case("two boxes", (cube(2), Box(tensor(-0.4, -2.0), tensor(0.3, 0.1)))),
+    Case("box and ball inside it", (cube(2), Ball(tensor(0.1, 0.2), tensor(0.3).squeeze()))),
+    Case("box and ball around it", (cube(2), Ball(tensor(0.1, 0.2), tensor(9.0).squeeze()))),
+    Case("box and ball across an edge", (cube(2), Ball(tensor(1.1, 0.2), tensor(0.9).squeeze()))),
+    Case("box and ball at a corner", (cube(2), Ball(tensor(1.5, 1.5), tensor(1.0).squeeze()))),
+    Case("box and ball in a thin slice", (cube(2), TIP)),
+    Case("box and a huge ball", (cube(2), Ball(tensor(70.0, 20.0), tensor(73.0).squeeze()))),
+    Case(
+        "two boxes and a ball",
+        (cube(2), Box(tensor(-1, 0.2), tensor(0.6, 1.0)), Ball(tensor(0.9, 0.1), tensor(0.5)[0])),
+    ),
+    Case("box and ball, d = 1", (cube(1), Ball(tensor(0.9), tensor(0.4)[0]))),
+    Case("box and ball, d = 6", (cube(6), random_ball(6, 0))),
+    Case("box and ball, d = 20", (cube(20), random_ball(20, 1))),
+    Case(
+        "two balls",
+        (cube(2), Ball(tensor(0.7, 0.2), tensor(0.8)[0]), Ball(tensor(-0.5, 0.0), tensor(0.8)[0])),
+        rounds=200,
+    ),
+    Case("half-space", (cube(2), HalfSpaces(tensor(1.0, 1.0)[None], tensor(0.3))), rounds=100),
+    Case(
+        "three half-spaces",
+        (
+            cube(3),
+            HalfSpaces(
+                torch.tensor([[1.0, 0.2, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 0.5]]).double(),
+                tensor(0.4, 0.1, torch.inf),
+            ),
+        ),
+        rounds=200,
+    ),
+    Case(
+        "half-space and ball",
+        (cube(2), HalfSpaces(tensor(0.0, -2.0)[None], tensor(0.0)), random_ball(2, 3)),
+        rounds=300,
+        error=1e-4,
+    ),
+)
+ALL_CASES = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+EXACT_CASES = pytest.mark.parametrize(
+    "case", [case for case in CASES if case.rounds == 1], ids=lambda case: case.name
+)
+
+
+def points(case: Case, count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(2)
+    return 1.5 * torch.randn(count, case.dim, generator=generator, dtype=torch.float64)
+
+
+def by_scipy(case: Case, point: Tensor) -> Tensor:
+    """Solve the same problem from its inequalities, which share no code with the sets."""
+
+    def inequality(each: ConstraintSet) -> Callable[[np.ndarray], np.ndarray]:
+        fields = {name: value.numpy() for name, value in each.fields().items()}
+        match each:
+            case Box():
+                return lambda a: np.concatenate([fields["high"] - a, a - fields["low"]])
+            case Ball():
+                return lambda a: fields["radius"] ** 2 - np.sum((a - fields["center"]) ** 2)
+            case HalfSpaces():
+                finite = np.isfinite(fields["offsets"])
+                return lambda a: (fields["offsets"] - fields["normals"] @ a)[finite]
+        raise NotImplementedError(type(each).__name__)
+
+    found = minimize(
+        lambda a: 0.5 * np.sum((a - point.numpy()) ** 2),
+        x0=np.zeros(case.dim),
+        jac=lambda a: a - point.numpy(),
+        constraints=[{"type": "ineq", "fun": inequality(each)} for each in case.sets],
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    return torch.from_numpy(found.x)
+
+
+@ALL_CASES
+def test_the_closest_point_is_the_solver_s(case: Case) -> None:
+    given = points(case, 12)
+    closest = project_onto_intersection(case.region(), given, case.rounds)
+    expected = torch.stack([by_scipy(case, point) for point in given])
+    assert case.region().slack(expected).min() > -1e-7, "the solver failed"
+    assert ((closest - given).norm(dim=-1) > 1e-3).any(), "nothing is projected: shows nothing"
+    assert (closest - expected).norm(dim=-1).max() <= case.error
+
+
+@EXACT_CASES
+def test_exact_projections_are_optimal(case: Case) -> None:
+    """The variational inequality: no allowed action lies in the direction of the given point."""
+    region, given = case.region(), points(case, 200)
+    closest = project_onto_intersection(region, given, case.rounds)
+    others = project_onto_intersection(region, points(case, 3000)[-500:], 1)
+    assert region.slack(closest).min() >= -1e-13 * 73
+    gain = ((others.unsqueeze(1) - closest) * (given - closest)).sum(-1)
+    assert gain.max() <= 1e-11
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@ALL_CASES
+def test_both_dtypes_and_any_batch_shape(case: Case, dtype: torch.dtype) -> None:
+    given = points(case, 60)
+    expected = project_onto_intersection(case.region(), given, case.rounds)
+    closest = project_onto_intersection(
+        case.region(dtype), given.to(dtype).reshape(3, 20, case.dim), case.rounds
+    )
+    assert closest.dtype == dtype
+    precision = 1e-3 if "huge" in case.name else 2e-5  # 73^2 rounding errors, over a width of 1
+    tolerance = precision if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(closest.reshape(60, -1), expected.to(dtype), rtol=0, atol=tolerance)
+
+
+@ALL_CASES
+def test_gradients_are_the_projection_s(case: Case) -> None:
+    # Random points lie on no kink; a step of 1e-6 stays on the same piece.
+    given = points(case, 3).requires_grad_()
+    region = case.region()
+    assert torch.autograd.gradcheck(
+        lambda point: project_onto_intersection(region, point, case.rounds), given, atol=1e-5
+    )
+
+
+@ALL_CASES
+def test_gradients_are_finite_where_points_are_special(case: Case) -> None:
+    special = [torch.zeros(case.dim), torch.ones(case.dim), torch.full((case.dim,), 1e6)]
+    special += [each.center for each in case.sets if isinstance(each, Ball)]
+    for point in special:
+        given = point.double().clone().requires_grad_()
+        project_onto_intersection(case.region(), given, case.rounds).sum().backward()
+        assert given.grad is not None
+        assert given.grad.isfinite().all()
+
+
+def test_dropped_sets_are_left_out() -> None:
+    ball, box = Ball(tensor(5.0, 5.0), tensor(1.0)[0]), Box(tensor(-9, -9), tensor(-5, -5.0))
+    sets, given = (cube(2), ball, box), torch.randn(50, 2, dtype=torch.float64)
+    active = torch.tensor([True, False, False])
+    region = Region(sets, tensor(0, 0), active)
+    closest = project_onto_intersection(region, given, 1)
+    torch.testing.assert_close(closest, given.clamp(-1, 1), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_dropped_half_spaces_are_left_out(rows: int) -> None:
+    away = HalfSpaces(tensor(1.0, 0.0).expand(rows, 2), tensor(-5.0).expand(rows))
+    given = torch.randn(50, 2, dtype=torch.float64)
+    region = Region((cube(2), away), tensor(0, 0), torch.tensor([True, False]))
+    closest = project_onto_intersection(region, given, 3)
+    torch.testing.assert_close(closest, given.clamp(-1, 1), rtol=0, atol=0)
+
+
+def test_each_batch_element_has_its_own_flags() -> None:
+    ball = Ball(torch.zeros(2, 2).double(), tensor(0.5, 0.5))
+    active = torch.tensor([[True, True], [True, False]])
+    given = tensor(3.0, 0.0).expand(2, 2)
+    closest = project_onto_intersection(Region((cube(2), ball), tensor(0, 0), active), given, 1)
+    torch.testing.assert_close(closest, torch.tensor([[0.5, 0.0], [1.0, 0.0]]).double())
+
+
+def test_more_rounds_come_closer() -> None:
+    balls = (Ball(tensor(0.7, 0.2), tensor(0.8)[0]), Ball(tensor(-0.5, 0.0), tensor(0.8)[0]))
+    region = Region((cube(2), *balls), tensor(0.1, 0.1))
+    given = torch.randn(200, 2, dtype=torch.float64)
+    best = project_onto_intersection(region, given, 2000)
+    errors = [
+        float((project_onto_intersection(region, given, rounds) - best).norm(dim=-1).max())
+        for rounds in (1, 5, 25, 125)
+    ]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] > 1e-2
+    assert errors[-1] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("each", "given"),
+    [
+        (Ellipsoid(tensor(0, 0), torch.eye(2).double()), "Ellipsoid"),
+        (WeightedL1Ball(tensor(1, 1), tensor(1.0)[0]), "WeightedL1Ball"),
+    ],
+    ids=["ellipsoid", "weighted l1"],
+)
+def test_other_families_are_refused(each: ConstraintSet, given: str) -> None:
+    message = rf"one of \['Box', 'Ball', 'HalfSpaces'\], given {given}; use the exact flow"
+    with pytest.raises(TypeError, match=message):
+        project(each, tensor(2, 2))
+    with pytest.raises(TypeError, match=message):
+        project_onto_intersection(Region((cube(2), each), tensor(0, 0)), tensor(2, 2), 1)
+
+
+def test_several_rows_have_no_closed_form_of_their_own() -> None:
+    with pytest.raises(TypeError, match="expected HalfSpaces of one row, given 2"):
+        project(HalfSpaces(torch.eye(2).double(), tensor(1, 1)), tensor(2, 2))
+
+
+@pytest.mark.parametrize(
+    "case", [CASES[1], CASES[8], CASES[-1]], ids=["boxes", "boxes and ball", "Dykstra"]
+)
+def test_it_compiles_to_one_graph(case: Case) -> None:
+    region, given = case.region(), points(case, 10)
+    torch._dynamo.reset()
+    compiled = torch.compile(
+        lambda point: project_onto_intersection(region, point, 2), backend="eager", fullgraph=True
+    )
+    torch.testing.assert_close(compiled(given), project_onto_intersection(region, given, 2))

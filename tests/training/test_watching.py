@@ -1,0 +1,202 @@
+"""``visual=...`` of the commands: what is recorded, and what it changes in the run: nothing."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import rerun_cli
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rerun.chunk import RrdReader
+from tensordict import TensorDict
+from torchrl.envs import EnvBase
+
+from cnfp_torchrl.modules import guarded
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.evaluation import evaluate_seeded
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.train import train
+from cnfp_torchrl.training.watching import EpisodeCollector, replay_episodes, watch_run
+from cnfp_torchrl.visual.stream import RunningViewer
+
+RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+FILE = ["visual=file", "visual.samples=16"]
+Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
+Config = Callable[..., DictConfig]
+
+
+def steps_of(path: Path, entity: str) -> list[int]:
+    """Return the steps at which an entity was logged."""
+    found: list[int] = []
+    for chunk in RrdReader(str(path)).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if "env_step" in batch.schema.names:
+            found += batch.column("env_step").to_pylist()
+    return sorted(found)
+
+
+def compare(one: RunFolder, other: RunFolder) -> int:
+    recordings = [str(folder.path / "recording.rrd") for folder in (one, other)]
+    return subprocess.run([RERUN, "rrd", "compare", *recordings], check=False).returncode
+
+
+OFF = """
+import sys
+from hydra import compose, initialize_config_dir
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.train import train
+import cnfp_torchrl.training.evaluate
+with initialize_config_dir(str(config_directory()), version_base="1.3"):
+    train(compose("train", overrides=sys.argv[2:]), RunFolder.create(sys.argv[1]))
+assert "rerun" not in sys.modules
+assert "cnfp_torchrl.visual" not in sys.modules
+"""
+
+
+def test_off_imports_nothing(tmp_path: Path) -> None:
+    tiny = ["collector.total_frames=32", "evaluation.episodes=2", "+env.base.max_steps=4"]
+    done = subprocess.run(
+        [sys.executable, "-c", OFF, tmp_path / "run", *tiny, "logger=none"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.rglob("*.rrd"))
+
+
+def test_the_recording_has_each_tenth_step_and_the_log(tiny_run: Run) -> None:
+    folder, _ = tiny_run(*FILE, "collector.total_frames=400", "training.log_interval=160")
+    path = folder.path / "recording.rrd"
+    # 16 agents are stepped together: 25 steps of each.
+    assert steps_of(path, "/explanation") == [0, 160, 320]
+    for name in ("violations/obstacle", "loss/qvalue", "loss/actor", "train/alpha"):
+        assert steps_of(path, f"/metrics/{name}") == [160, 320, 400], name
+
+
+def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run) -> None:
+    unwatched = tiny_run("training.warmup_frames=48")
+    one, other, different = (
+        tiny_run(*FILE, "training.warmup_frames=48", "visual.every=1", f"seed={seed}")
+        for seed in (0, 0, 1)
+    )
+    for key in ("return_mean", "violations", "evaluation"):
+        assert one[1][key] == unwatched[1][key]
+    states = [folder.load_checkpoint()["loss"] for folder in (one[0], unwatched[0])]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+    assert compare(one[0], other[0]) == 0
+    assert compare(one[0], different[0]) != 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["visual=file", "visual.every=0"], "visual.every: expected a number >= 1, given 0"),
+        (["visual=file", "visual.episodes=0"], "visual.episodes: expected a number >= 1"),
+        (["visual=file", "visual.projections=[[0,7]]"], "projection"),
+        (["visual=spawn"], "visual=spawn: expected a display"),
+        (["visual=connect", "visual.viewer.url=rerun+http://127.0.0.1:1/proxy"], "found none"),
+        (["visual=serve", "visual.viewer.port=70000"], "viewer.port: expected a free port"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_before_anything_is_left(
+    overrides: list[str],
+    message: str,
+    make_config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    folder = RunFolder.create(tmp_path / "run")
+    with pytest.raises(Exception, match=message):
+        train(make_config(*overrides), folder)
+    assert not list(folder.path.iterdir())
+
+
+def test_a_recording_is_never_overwritten(make_config: Config, tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / "recording.rrd").write_text("precious")
+    with pytest.raises(FileExistsError, match=r"recording\.rrd exists"):
+        train(make_config(*FILE), folder)
+    assert (folder.path / "recording.rrd").read_text() == "precious"
+
+
+@pytest.fixture
+def server() -> Iterator[psutil.Popen]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [RERUN, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)]
+    process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process.url = f"rerun+http://127.0.0.1:{port}/proxy"
+    while not RunningViewer(process.url).is_listening():
+        assert process.poll() is None
+        time.sleep(0.05)
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("fate", [None, signal.SIGSTOP, signal.SIGKILL])
+def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
+    fate: signal.Signals | None, server: psutil.Popen, tiny_run: Run, tmp_path: Path
+) -> None:
+    reference, summary = tiny_run(*FILE, "visual.every=1")
+
+    def strike() -> None:
+        while not list(tmp_path.glob("run1/recording.rrd")):
+            time.sleep(0.01)
+        server.send_signal(fate)
+
+    if fate is not None:
+        threading.Thread(target=strike).start()
+    live = ["visual=connect", f"visual.viewer.url={server.url}", "visual.samples=16"]
+    folder, watched = tiny_run(*live, "visual.every=1")
+    assert watched["return_mean"] == summary["return_mean"]
+    assert compare(folder, reference) == 0
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_replayed_episodes_are_those_of_the_evaluation(
+    deterministic: bool, tiny_run: Run, tmp_path: Path
+) -> None:
+    folder, _ = tiny_run()
+    config = folder.load_config()
+    settings = EvaluationSettings(episodes=5, seed=7)
+
+    def made() -> tuple[EnvBase, Any]:
+        env = build_environment(config, batch_size=[5], with_centre=True)
+        return env, load_actor(folder, config, env)
+
+    env, actor = made()
+    expected = evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic).returns
+    episodes = replay_episodes(*made(), settings, [0, 3], deterministic)
+    for number, episode in zip((0, 3), episodes, strict=True):
+        assert len(episode) == 12
+        total = sum(float(step["next", "reward"]) for step in episode)
+        assert total == pytest.approx(float(expected[number]), rel=1e-5)
+
+    watch = instantiate({"_target_": "cnfp_torchrl.visual.stream.Watch", "episodes": 2})
+    watch_run(folder, settings, watch, tmp_path / "recording.rrd").close()
+    assert steps_of(tmp_path / "recording.rrd", "/explanation") == list(range(24))
+
+
+def test_episodes_of_an_environment_without_batch_follow_each_other() -> None:
+    kept = EpisodeCollector([1])
+    for step, done in enumerate([False, True, False, False, True, True]):
+        kept(TensorDict({"step": step, "next": {"done": torch.tensor([done])}}, []))
+    assert [int(each["step"]) for each in kept.episodes[1]] == [2, 3, 4]
