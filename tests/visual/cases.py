@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Bounded
+from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.geometry import (
     Ball,
@@ -60,6 +61,36 @@ def first(sets: Mapping[str, ConstraintSet], count: int) -> dict[str, Constraint
     return dict(list(sets.items())[:count])
 
 
+def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
+    region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
+    assert region.active is not None
+    state = TensorDict({"observation": torch.zeros(3)}, [])
+    state["constraints", "centre"] = region.centre
+    for k, (name, each) in enumerate(sets.items(), start=1):
+        state["constraints", name, "active"] = region.active[k]
+        for field, value in each.fields().items():
+            state["constraints", name, field] = value
+    return state
+
+
+def make_actor(
+    sets: Mapping[str, ConstraintSet],
+    flow: str = "exact",
+    *,
+    dim: int = 2,
+    loc: Tensor | None = None,
+    scale: Tensor | None = None,
+) -> SafeProbabilisticTensorDictSequential:
+    return make_constrained_actor(
+        Gaussian(
+            torch.zeros(dim) if loc is None else loc, torch.ones(dim) if scale is None else scale
+        ),
+        Bounded(-torch.ones(dim), torch.ones(dim)),
+        [ConstraintBijector(name, type(each)) for name, each in sets.items()],
+        flow=flow,
+    )
+
+
 def make_snapshot(
     sets: Mapping[str, ConstraintSet],
     flow: str = "exact",
@@ -69,20 +100,5 @@ def make_snapshot(
     scale: Tensor | None = None,
     samples: int = 200,
 ) -> FlowSnapshot:
-    region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
-    assert region.active is not None
-    state = TensorDict({"observation": torch.zeros(3)}, [])
-    state["constraints", "centre"] = region.centre
-    for k, (name, each) in enumerate(sets.items(), start=1):
-        state["constraints", name, "active"] = region.active[k]
-        for field, value in each.fields().items():
-            state["constraints", name, field] = value
-    actor = make_constrained_actor(
-        Gaussian(
-            torch.zeros(dim) if loc is None else loc, torch.ones(dim) if scale is None else scale
-        ),
-        Bounded(-torch.ones(dim), torch.ones(dim)),
-        [ConstraintBijector(name, type(each)) for name, each in sets.items()],
-        flow=flow,
-    )
-    return take_snapshot(actor, state, samples=samples)
+    actor = make_actor(sets, flow, dim=dim, loc=loc, scale=scale)
+    return take_snapshot(actor, make_state(sets, dim), samples=samples)

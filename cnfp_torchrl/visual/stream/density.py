@@ -1,0 +1,98 @@
+"""The density of a flow policy after each stage, on a fixed grid of actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from cnfp_torchrl.bijectors import Bijector
+from cnfp_torchrl.visual.outlines import Line
+from cnfp_torchrl.visual.snapshot import FlowSnapshot, stage_bijector
+
+Heat: TypeAlias = NDArray[np.uint8]
+
+_DEPTH = 7.0
+"""Densities of this many nats below the highest are drawn as nothing."""
+_SPIKES = 0.995
+"""A saturated flow crowds at boundaries without limit; this share of the cells sets the scale."""
+
+
+class ActionGrid:
+    """The middles of equal cells over a box of actions of one or two components.
+
+    Args:
+        limits: lowest and highest value of each component.
+        cells: along each component.
+    """
+
+    def __init__(self, limits: Sequence[tuple[float, float]], cells: int) -> None:
+        share = (torch.arange(cells) + 0.5) / cells
+        axes = [low + (high - low) * share for low, high in limits]
+        self.actions = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)
+        """``(cells, d)`` or, the second component first, ``(cells, cells, d)``."""
+
+    def log_densities(self, snapshot: FlowSnapshot) -> Tensor:
+        """Return the log-density after each stage, ``(stages, *cells)``; -inf outside.
+
+        In the precision of the snapshot, which is much finer than colours are.
+
+        Args:
+            snapshot: the policy in a state.
+        """
+        region = snapshot.region
+        normal = Normal(snapshot.loc, snapshot.scale, validate_args=False)
+        base = Independent(normal, 1, validate_args=False)
+        stages = [stage.applied for stage in snapshot.stages]
+        if not snapshot.is_exact:
+            bijectors = [stage_bijector(snapshot.flow, region, applied) for applied in stages]
+            return torch.stack([self._log_density(base, each) for each in bijectors])
+        # All stages in one pass: to an exact flow, a set not yet applied is one that is not active.
+        applied = torch.tensor([[k in each for k in range(len(region.sets))] for each in stages])
+        active = applied if region.active is None else applied & region.active
+        active = active.reshape(len(stages), *(1,) * (self.actions.ndim - 1), -1)
+        bijector = snapshot.flow(region.bounds, region.sets[1:], region.centre, active)
+        return self._log_density(base, bijector, len(stages))
+
+    def _log_density(self, base: Distribution, bijector: Bijector, *batch: int) -> Tensor:
+        actions = self.actions.expand(*batch, *self.actions.shape)
+        latent, log_det = bijector.inverse_and_log_det(actions)
+        # Actions outside the image have no latent, and the inverse of tanh says so by its NaN; the
+        # parameters of the flow were found finite before.
+        outside = ~latent.isfinite().all(-1)
+        return (base.log_prob(latent) + log_det).masked_fill(outside, -torch.inf)
+
+    def curves(self, log_density: Tensor) -> list[Line]:
+        """Return actions and densities, in one dimension, of each stage, ``(cells, 2)``.
+
+        Args:
+            log_density: of all stages of one step, ``(stages, cells)``; the highest is drawn at 1.
+        """
+        values = log_density.numpy()
+        heights = np.exp(np.minimum(values - _top(values), 0.0))
+        return [np.stack([self.actions[:, 0].numpy(), each], axis=-1) for each in heights]
+
+
+def as_bytes(log_density: Tensor) -> Heat:
+    """Return log-densities as brightness: 0 where there is next to none, 255 at most.
+
+    Args:
+        log_density: of all stages of one step, which compare with each other.
+    """
+    values = log_density.numpy()
+    share = np.clip((values - (_top(values) - _DEPTH)) / _DEPTH, 0.0, 1.0)
+    return np.round(255 * share).astype(np.uint8)
+
+
+def _top(values: NDArray[np.float64]) -> float:
+    """Return the log-density that the scale ends at, 0 where there is none at all."""
+    finite = values[np.isfinite(values)]
+    if len(finite) == 0:
+        return 0.0
+    rank = int(_SPIKES * (len(finite) - 1))
+    return float(np.partition(finite, rank)[rank])

@@ -1,0 +1,82 @@
+"""The entities of one view: styles once, positions when they change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import ArrayLike, NDArray
+
+_POINT = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
+_END: NDArray[np.int32] = np.zeros(1, dtype=np.int32)
+_NOTHING: NDArray[np.float32] = np.zeros((0, 2), dtype=np.float32)
+_STRIP = pa.list_(pa.field("item", _POINT, nullable=False))
+
+
+class Entities:
+    """Log what lies below one entity path, and leave out what is as it was.
+
+    Rerun shows the latest value at a time, so that an entity logged once stands until it changes.
+
+    Args:
+        stream: where to log.
+        root: the path.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, root: str) -> None:
+        self._stream, self._root = stream, root
+        self._last: dict[str, tuple[NDArray[np.int32], NDArray[np.float32]]] = {}
+
+    def style(self, name: str, *archetypes: rr.AsComponents) -> None:
+        """Log what never changes; such as has no positions, which would hide those of the steps.
+
+        Args:
+            name: of the entity, or nothing for the root itself.
+            archetypes: of the entity.
+        """
+        self._stream.log(f"{self._root}/{name}".rstrip("/"), *archetypes, static=True)
+
+    def points(self, name: str, positions: ArrayLike) -> None:
+        """Log points ``(n, 2)``."""
+        given = np.asarray(positions, dtype=np.float32).reshape(-1, 2)
+        if self._is_new(name, _END, given):
+            self.log(name, rr.Points2D.from_fields(positions=given))
+
+    def lines(self, name: str, strips: Sequence[ArrayLike] | NDArray[np.float32]) -> None:
+        """Log lines, each ``(points, 2)``."""
+        ends, flat = _joined(strips)
+        if self._is_new(name, ends, flat):
+            self.log(name, rr.LineStrips2D.from_fields(strips=_arrow(ends, flat)))
+
+    def log(self, name: str, archetype: rr.AsComponents) -> None:
+        """Log anything else."""
+        self._stream.log(f"{self._root}/{name}", archetype)
+
+    def _is_new(self, name: str, ends: NDArray[np.int32], flat: NDArray[np.float32]) -> bool:
+        # An entity that was never logged shows nothing, as an empty one does.
+        last_ends, last = self._last.get(name, (_END, _NOTHING))
+        self._last[name] = ends, flat
+        return not (np.array_equal(last, flat) and np.array_equal(last_ends, ends))
+
+
+def _joined(
+    strips: Sequence[ArrayLike] | NDArray[np.float32],
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return where each line begins and the last one ends, and the points of all lines."""
+    if isinstance(strips, np.ndarray):
+        lines, points, _ = strips.shape
+        ends = np.arange(0, lines * points + 1, points, dtype=np.int32)
+        return ends, np.ascontiguousarray(strips, dtype=np.float32).reshape(-1, 2)
+    if not strips:
+        return _END, _NOTHING
+    given = [np.asarray(strip, dtype=np.float32) for strip in strips]
+    ends = np.cumsum([0, *map(len, given)], dtype=np.int32)
+    return ends, np.concatenate([each.reshape(-1, 2) for each in given])
+
+
+def _arrow(ends: NDArray[np.int32], flat: NDArray[np.float32]) -> pa.Array:
+    """Return lines in Rerun's own format; its converter takes ten times as long for many lines."""
+    points = pa.FixedSizeListArray.from_arrays(pa.array(flat.reshape(-1)), type=_POINT)
+    return pa.ListArray.from_arrays(pa.array(ends), points, type=_STRIP)

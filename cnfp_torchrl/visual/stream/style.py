@@ -1,0 +1,48 @@
+"""Colours and sizes on a dark background; constraints keep the colours of all figures."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from cnfp_torchrl.visual.colours import GOAL, STATION, rgb
+
+Colour = tuple[int, int, int]
+
+BACKGROUND: Colour = (0, 0, 4)
+PALE: Colour = (235, 235, 240)
+MUTED: Colour = (120, 122, 135)
+FAINT: Colour = (62, 64, 76)
+WAY: Colour = (84, 70, 120)
+SAMPLE: Colour = (190, 196, 214)
+BREAKS: Colour = (255, 226, 30)
+EXECUTED: Colour = (80, 255, 190)
+OBSTACLE: Colour = (84, 86, 98)
+TRAIL: Colour = (150, 154, 170)
+REWARD: Colour = (240, 190, 80)
+GLOW: Colour = (160, 47, 127)
+CURVE: Colour = (160, 120, 230)
+ZONE: Colour = (14, 62, 52)
+GOAL_ZONE: Colour = (78, 56, 12)
+GOAL_COLOUR: Colour = rgb(GOAL)
+STATION_COLOUR: Colour = rgb(STATION)
+
+HEAT: Literal["magma"] = "magma"
+HEAT_TOP = 420
+"""Bytes up to 255 are drawn with the lower part of the colours, which lines stand out from."""
+
+# Radii on the screen, which Rerun tells from those in the scene by their sign.
+THIN = -0.8
+LINE = -1.3
+WIDE = -2.2
+BAR = -3.0
+DOT = -1.3
+BAD_DOT = -2.0
+KNOT = -3.0
+MARK = -5.5
+MARK_INSIDE = -3.5
+
+
+def dimmed(colour: Colour) -> Colour:
+    """Return a colour half way to the background, for what does not hold."""
+    red, green, blue = ((c + b) // 2 for c, b in zip(colour, BACKGROUND, strict=True))
+    return red, green, blue

@@ -1,0 +1,154 @@
+"""What is said of a step is what happened in it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
+from cnfp_torchrl.visual import FlowSnapshot
+from cnfp_torchrl.visual.explanation import explain
+from cnfp_torchrl.visual.words import ConstraintEffect, Explanation
+from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_snapshot
+
+t = torch.tensor
+STILL = torch.full((2,), 1e-3)
+
+
+def executing(sets: dict[str, ConstraintSet], at: list[float], flow: str = "exact") -> FlowSnapshot:
+    """Return a snapshot whose samples all lie within a hair of one latent."""
+    return make_snapshot(sets, flow, loc=t(at), scale=STILL, samples=50)
+
+
+def effects(explanation: Explanation) -> dict[str, str]:
+    return {each.name: each.effect for each in explanation.constraints}
+
+
+def only(explanation: Explanation) -> ConstraintEffect:
+    (effect,) = explanation.constraints
+    return effect
+
+
+def test_a_constraint_that_binds_is_restrictive() -> None:
+    # tanh(1) = 0.762 in both components; the box ends at 0.5 in the first one. From the centre, 0
+    # (the box is symmetric), the way to the action is cut where its first component is 0.5.
+    walls = {"wall": Box(t([-0.5, -1.0]), t([0.5, 1.0]))}
+    explanation = explain(executing(walls, [1.0, 1.0]))
+    wall = only(explanation)
+    assert wall.effect == "restrictive"
+    assert wall.share_moved == 1
+    assert wall.share_allowed == pytest.approx(0.5, abs=0.01)
+    assert wall.share_outside == 0
+    assert wall.before == pytest.approx((0.762, 0.762), abs=0.005)
+    # Retraction divides by the gauge at 0.762: tanh reaches 1 where the wall's way reaches 0.5.
+    assert wall.after == pytest.approx((0.381, 0.381), abs=0.005)
+    assert wall.moved == pytest.approx(2**0.5 * 0.381, abs=0.005)
+    assert explanation.action == wall.after
+    assert "Wall moved the executed action by 0.53" in explanation.text()
+
+
+def test_a_constraint_that_does_not_bind_is_permissive() -> None:
+    far = {"far": Ball(t([0.0, 0.0]), t(9.0))}
+    explanation = explain(executing(far, [1.0, 1.0]))
+    assert only(explanation).effect == "permissive"
+    assert only(explanation).moved == 0
+    assert only(explanation).share_allowed == 1
+    assert only(explanation).before == only(explanation).after
+    assert "No constraint changed the executed action." in explanation.text()
+    assert "it changed none of 50 samples" in explanation.text()
+
+
+def test_a_constraint_can_bind_on_other_samples_alone() -> None:
+    wall = {"wall": Box(t([-1.0, -1.0]), t([0.5, 1.0]))}
+    snapshot = make_snapshot(wall, loc=t([-0.5, 0.0]), samples=500)
+    moved = snapshot.stages[1].samples != snapshot.stages[0].samples
+    left = int((~moved.any(-1)).nonzero()[0])
+    explanation = explain(replace(snapshot, followed=left))
+    assert only(explanation).effect == "restrictive"
+    assert only(explanation).moved == 0
+    share = only(explanation).share_moved
+    assert share is not None
+    assert share == pytest.approx(float(moved.any(-1).double().mean()), abs=0.02)
+    assert "it left the executed action as it was" in explanation.text()
+
+
+def test_a_constraint_that_cannot_hold_is_dropped() -> None:
+    explanation = explain(make_snapshot(CONFLICT))
+    assert effects(explanation) == {"far": "dropped", "near": "restrictive"}
+    assert "far: dropped, no action within the bounds keeps it together with near." in (
+        explanation.text()
+    )
+    assert "far is dropped" in explanation.markdown()
+
+
+@pytest.mark.parametrize("flow", ["none", "squash"])
+def test_flows_that_guarantee_nothing_are_seen_to_break(flow: str) -> None:
+    snapshot = make_snapshot(PLANE, flow, samples=500)
+    for index in range(50):
+        explanation = explain(replace(snapshot, followed=index))
+        action = snapshot.stages[-1].samples[index]
+        for effect, allowed in zip(explanation.constraints, snapshot.region.sets[1:], strict=True):
+            inside = bool(allowed.contains(action))
+            assert (effect.effect == "broken") == (not inside)
+            assert (effect.slack < 0) == (not inside)
+            assert effect.share_moved is None
+            outside = ~allowed.contains(snapshot.stages[-1].samples)
+            assert effect.share_outside == pytest.approx(float(outside.double().mean()))
+    text = explain(snapshot).text()
+    assert ("is broken" in text) == ("broken" in effects(explain(snapshot)).values())
+
+
+def test_shares_are_areas() -> None:
+    # Ball of radius 0.8 in a square of side 2; the box cuts [0.5, 1] and [0.4, 1] off.
+    explanation = explain(make_snapshot({name: PLANE[name] for name in ("speed", "obstacle")}))
+    speed, obstacle = explanation.constraints
+    assert speed.share_allowed == pytest.approx(torch.pi * 0.64 / 4, abs=0.02)
+    assert obstacle.share_allowed == pytest.approx(1.5 * 1.4 / 4, abs=0.02)
+    assert explanation.share_allowed is not None
+    assert explanation.share_allowed < min(speed.share_allowed, obstacle.share_allowed)
+
+
+@pytest.mark.parametrize(
+    ("sets", "dim", "flow"),
+    [
+        (LINE, 1, "exact"),
+        (LINE, 1, "squash"),
+        (PLANE, 2, "radial"),
+        (SPACE, 3, "exact"),
+        ({}, 5, "exact"),
+    ],
+)
+def test_any_dimension_and_any_number_of_constraints(
+    sets: dict[str, ConstraintSet], dim: int, flow: str
+) -> None:
+    snapshot = make_snapshot(sets, flow, dim=dim)
+    explanation = explain(snapshot)
+    assert [each.name for each in explanation.constraints] == list(sets)
+    assert len(explanation.action) == dim
+    assert (explanation.share_allowed is None) == (dim > 3)
+    for said in (explanation.text(), explanation.markdown()):
+        assert all(name in said for name in sets)
+        assert "nan" not in said
+        assert "None" not in said
+
+
+def test_what_the_environment_says_is_passed_on() -> None:
+    snapshot = make_snapshot(LINE, dim=1)
+    explanation = explain(snapshot, facts={"box": "The end is near."}, situation="At home.")
+    for said in (explanation.text(), explanation.markdown()):
+        assert "At home." in said
+        assert said.count("The end is near.") == 1
+
+
+def test_an_action_of_another_policy_has_no_way() -> None:
+    explanation = explain(replace(make_snapshot(PLANE), is_recovered=False))
+    assert explanation.latent is None
+    assert all(each.before is None and each.moved is None for each in explanation.constraints)
+    assert "the way of the executed action is unknown" in explanation.text()
+
+
+def test_markdown_is_a_table() -> None:
+    lines = explain(make_snapshot({"a|b": PLANE["speed"]})).markdown().splitlines()
+    rows = [line for line in lines if line.startswith("|")]
+    assert len(rows) == 6
+    assert {row.replace("\\|", "").count("|") for row in rows} == {7}
