@@ -1,5 +1,6 @@
 """Bijections from base samples to allowed actions, with exact log-determinants."""
 
+from cnfp_torchrl.bijectors.aligned_squash import AlignedSquash
 from cnfp_torchrl.bijectors.ball_squash import BallSquash
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.box_squash import BoxSquash
@@ -13,6 +14,7 @@ from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
 
 __all__ = [
+    "AlignedSquash",
     "BallSquash",
     "Bijector",
     "BijectorChain",

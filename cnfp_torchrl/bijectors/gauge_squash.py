@@ -84,14 +84,7 @@ class GaugeSquash(Bijector):
         return self.region.centre + offset / share.unsqueeze(-1), share
 
     def _share(self, offset: Tensor) -> Tensor:
-        rays = Rays(offset, self._outer)
-        if not self._inner:
-            return torch.ones_like(rays.progress)
-        gauges = [gauge(rays.direction) for gauge in self._inner]
-        if len(gauges) > 1:
-            # Not one maximum after the other: the gradient of each costs as much as of all at once.
-            gauges = [torch.stack(torch.broadcast_tensors(*gauges)).amax(0)]
-        return rays.share(gauges[0])
+        return Rays(offset, self._outer).share_of_all(self._inner)
 
     def _shares(self, offset: Tensor) -> Tensor:
         """Return the share after each stage, ``(K + 1, *batch)``."""

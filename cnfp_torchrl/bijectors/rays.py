@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -76,6 +78,16 @@ class Rays:
             inner: the inner set's gauge in `direction`, ``(*stages, *batch)``.
         """
         return (inner / self._outer).clamp(min=1).reciprocal()
+
+    def share_of_all(self, inner: Sequence[Gauge]) -> Tensor:
+        """Return the share that lies in all of some inner sets, given by their gauges."""
+        if not inner:
+            return torch.ones_like(self.progress)
+        gauges = [gauge(self.direction) for gauge in inner]
+        if len(gauges) == 1:
+            return self.share(gauges[0])
+        # Not one maximum after the other: the gradient of each costs as much as of all at once.
+        return self.share(torch.stack(torch.broadcast_tensors(*gauges)).amax(0))
 
 
 def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.flows import (
     ExactFlow,
     Flow,
+    GaugeFlow,
     PaperChain,
     ProjectionFlow,
     RadialFlow,
@@ -29,6 +30,7 @@ __all__ = [
     "ExecutedActionGuard",
     "Flow",
     "FlowMap",
+    "GaugeFlow",
     "LatentActor",
     "MissingGeometryError",
     "PaperChain",

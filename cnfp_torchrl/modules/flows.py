@@ -12,6 +12,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from cnfp_torchrl.bijectors import (
+    AlignedSquash,
     Bijector,
     BijectorChain,
     BoxSquash,
@@ -55,6 +56,23 @@ class Flow(ABC):
 
 class ExactFlow(Flow):
     """A tanh squash into the action bounds, then retractions into the intersection (default)."""
+
+    is_exact = True
+
+    def __call__(
+        self,
+        bounds: Box,
+        sets: Sequence[ConstraintSet],
+        centre: Tensor | None,
+        active: Tensor | None,
+    ) -> AlignedSquash:
+        assert centre is not None
+        region = Region((bounds, *sets), centre, active, validate_args=False)
+        return AlignedSquash(region, validate_args=False)
+
+
+class GaugeFlow(Flow):
+    """The exact flow with every retraction radial, of boxes too."""
 
     is_exact = True
 
@@ -167,6 +185,7 @@ class UnconstrainedFlow(Flow):
 
 FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
+    "gauge": GaugeFlow,
     "radial": RadialFlow,
     "squash": PaperChain,
     "projection": ProjectionFlow,

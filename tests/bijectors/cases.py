@@ -12,6 +12,7 @@ from mpmath import mpf
 from torch import Tensor
 
 from cnfp_torchrl.bijectors import (
+    AlignedSquash,
     Bijector,
     BijectorChain,
     BoxSquash,
@@ -33,6 +34,12 @@ from cnfp_torchrl.geometry import (
 )
 from tests.bijectors import reference
 
+FLOWS = {
+    "aligned": reference.aligned_squash,
+    "gauge": reference.gauge_squash,
+    "radial": reference.radial_squash,
+    "retraction": reference.gauge_squash,
+}
 DTYPES = (torch.float32, torch.float64)
 
 
@@ -42,7 +49,7 @@ class Case:
 
     Args:
         name: for the test's id.
-        kind: squash, chain (the paper's), gauge, radial or retraction.
+        kind: squash, chain (the paper's), aligned, gauge, radial or retraction.
         sets: in order of application, float64 of values that float32 holds too.
         centre: of the kinds that have one, ``(*batch, d)``.
         active: which sets hold, ``(*batch, len(sets))``; None means all.
@@ -99,6 +106,8 @@ class Case:
                 return paper_squash(self.cast(dtype)[0])
             case "chain":
                 return BijectorChain([paper_squash(each) for each in self.cast(dtype)])
+            case "aligned":
+                return AlignedSquash(self.region(dtype))
             case "gauge":
                 return GaugeSquash(self.region(dtype))
             case "radial":
@@ -134,7 +143,7 @@ class Case:
             return reference_chain(sets)
         assert self.centre is not None
         centre = self.centre.expand((*self.batch_shape, self.dim))[index]
-        flow = reference.radial_squash if self.kind == "radial" else reference.gauge_squash
+        flow = FLOWS[self.kind]
         return lambda latent: flow(sets, centre, latent)
 
 
@@ -347,6 +356,7 @@ def regions() -> Regions:
     add("ball-d2", Maker(2, seed=24), Maker.ball)
     add("box-ball-d2", Maker(2, seed=25), Maker.box, Maker.ball)
     add("open-box-d2", Maker(2, seed=26), Maker.open_box)
+    add("boxes-d6-batch", Maker(6, (3,), seed=43), Maker.box, Maker.open_box)
     add("ellipsoid-d2-batch", Maker(2, (4,), seed=27), Maker.ellipsoid)
     add("half-spaces-l1-d2", Maker(2, seed=28), Maker.half_spaces, Maker.weighted_l1)
     add("far-d2", Maker(2, offset=100.0, seed=29), Maker.ball, Maker.half_spaces)
@@ -437,6 +447,8 @@ def exact_flows() -> tuple[Case, ...]:
     for name, (sets, centre, active) in regions().items():
         smooth = len(sets) == 1
         found.append(Case(f"gauge-{name}", "gauge", sets, centre, active, smooth=smooth))
+        boxes = all(isinstance(each, Box) for each in sets)
+        found.append(Case(f"aligned-{name}", "aligned", sets, centre, active, smooth=boxes))
         found.append(Case(f"radial-{name}", "radial", sets, centre, active))
     plane, many = Maker(2, seed=40), Maker(6, (3,), slack=0.05, seed=41)
     tight = Maker(3, (5,), slack=1e-4, seed=42)

@@ -167,6 +167,27 @@ def gauge_squash(
     return along(c, offset, share), log_det + len(latent) * mp.log(share)
 
 
+def aligned_squash(
+    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+) -> tuple[Vector, mpf]:
+    """Scale each component to the intersection of the boxes, then retract from there."""
+    boxes, others = ([s for s in sets if isinstance(s, Box) == is_box] for is_box in (True, False))
+    low, high = boxes[0].low, boxes[0].high
+    for box in boxes[1:]:
+        low, high = low.maximum(box.low), high.minimum(box.high)
+    c = to_mp(centre)
+    bounded, log_det = box_squash(boxes[0], latent)
+    offset = []
+    for i, x in enumerate(bounded):
+        sides = (high, boxes[0].high) if x > c[i] else (low, boxes[0].low)
+        ratio = (to_mp(sides[0])[i] - c[i]) / (to_mp(sides[1])[i] - c[i])
+        offset.append((x - c[i]) * ratio)
+        log_det += mp.log(ratio)
+    merged = Box(low, high)
+    share = exit_along(c, offset, [merged, *others]) / exit_along(c, offset, [merged])
+    return along(c, offset, share), log_det + len(latent) * mp.log(share)
+
+
 def radial_squash(
     sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:

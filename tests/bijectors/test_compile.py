@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.bijectors import (
+    AlignedSquash,
     Bijector,
     BijectorChain,
     BoxSquash,
@@ -64,6 +65,8 @@ def build(case: Case, fields: list[dict[str, Tensor]], centre: Tensor) -> Biject
         squash = BoxSquash(outer.low, outer.high, validate_args=False)
         return BijectorChain([squash, Retraction(outer, sets[1], centre)])
     region = Region(sets, centre, case.active)
+    if case.kind == "aligned":
+        return AlignedSquash(region, validate_args=False)
     if case.kind == "gauge":
         return GaugeSquash(region, validate_args=False)
     return RadialSquash(region)

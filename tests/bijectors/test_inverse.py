@@ -32,7 +32,13 @@ def test_inverse_undoes_forward(case: Case, dtype: torch.dtype) -> None:
 
     assert bijector.contains(action)[resolved].all()
     assert ((found - z).abs().amax(-1) <= moved)[resolved].all()
-    assert ((inverse_log_det + log_det).abs() <= 6 * case.dim * moved)[resolved].all()
+    scored = resolved
+    if case.kind == "aligned":
+        # The density jumps where a component of the offset changes its sign.
+        offset = exact.stages(z.double()).actions[0] - case.centre
+        scored = scored & (offset.abs() > eps * case.size).all(-1)
+        assert scored.double().mean() > (0.2 if dtype == torch.float32 else 0.8)
+    assert ((inverse_log_det + log_det).abs() <= 6 * case.dim * moved)[scored].all()
     assert ((again - action).abs().amax(-1) <= eps * case.size)[resolved].all()
 
 

@@ -6,11 +6,13 @@ import pytest
 import torch
 
 from cnfp_torchrl.bijectors import BoxSquash
-from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents
+from cnfp_torchrl.geometry import Ball, Box
+from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, tensor
 from tests.bijectors.numeric import log_abs_det
 
 ids = {"ids": lambda case: case.name}
-INTERSECTING = [case for case in CASES if case.kind in ("gauge", "radial", "retraction")]
+RETRACTING = ("aligned", "gauge")
+INTERSECTING = [case for case in CASES if case.kind in (*RETRACTING, "radial", "retraction")]
 
 
 def stage_count(case: Case) -> int:
@@ -30,7 +32,7 @@ def test_last_stage_is_the_flow(case: Case, dtype: torch.dtype) -> None:
     torch.testing.assert_close(stages.log_dets[-1], log_det, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.kind == "gauge"], **ids)
+@pytest.mark.parametrize("case", [case for case in CASES if case.kind in RETRACTING], **ids)
 def test_first_stage_is_the_squash_into_the_bounds(case: Case) -> None:
     bounds = cast(case.sets[0], torch.float64)
     z = latents(case, 20, torch.float64)
@@ -82,11 +84,37 @@ def test_each_stage_of_the_chain_is_inside_its_own_set(case: Case) -> None:
         assert case.allows_stage(stage, action).all()
 
 
-def test_a_dropped_set_changes_nothing() -> None:
-    case = next(case for case in CASES if case.name == "gauge-dropped-d3-batch")
+@pytest.mark.parametrize("kind", RETRACTING)
+def test_a_dropped_set_changes_nothing(kind: str) -> None:
+    case = next(case for case in CASES if case.name == f"{kind}-dropped-d3-batch")
     assert case.active is not None
     stages = case.build(torch.float64).stages(latents(case, 50, torch.float64))
     for stage in range(1, len(case.sets)):
         same = (stages.actions[stage] == stages.actions[stage - 1]).all(-1).all(0)
         assert same[~case.active[:, stage]].all()
         assert not same[case.active[:, stage]].all()
+
+
+def test_a_box_leaves_the_motion_along_it_alone() -> None:
+    """What aligned and radial retractions differ in, and that they agree without boxes."""
+    bounds, wall = (
+        Box(tensor(-1.0, -1.0), tensor(1.0, 1.0)),
+        Box(tensor(-2.0, -2.0), tensor(2.0, 0.1)),
+    )
+    far = tensor(20.0, 20.0)
+    aligned, radial = (
+        Case("", kind, (bounds, wall), tensor(0.0, 0.0)).build(torch.float64)
+        for kind in ("aligned", "gauge")
+    )
+    torch.testing.assert_close(aligned(far), tensor(1.0, 0.1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(radial(far), tensor(0.1, 0.1), rtol=0, atol=1e-6)
+    ball = Ball(tensor(0.3, 0.0), tensor(0.9).squeeze())
+    aligned, radial = (
+        Case("", kind, (bounds, ball), tensor(0.0, 0.0)).build(torch.float64)
+        for kind in ("aligned", "gauge")
+    )
+    z = torch.randn(100, 2, dtype=torch.float64)
+    for given, expected in zip(
+        aligned.forward_and_log_det(z), radial.forward_and_log_det(z), strict=True
+    ):
+        torch.testing.assert_close(given, expected, rtol=0, atol=1e-14)

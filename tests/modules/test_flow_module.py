@@ -14,6 +14,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.bijectors import (
+    AlignedSquash,
     BijectorChain,
     BoxSquash,
     GaugeSquash,
@@ -33,8 +34,8 @@ from cnfp_torchrl.modules import (
 )
 from cnfp_torchrl.modules.flow_module import action_bounds
 
-FLOWS = ["exact", "radial", "squash", "none"]
-EXACT_FLOWS = ["exact", "radial"]
+FLOWS = ["exact", "gauge", "radial", "squash", "none"]
+EXACT_FLOWS = ["exact", "gauge", "radial"]
 SAFE_FLOWS = [*EXACT_FLOWS, "projection"]  # the last without a density
 EXPLORATION_TYPES = [
     ExplorationType.RANDOM,
@@ -114,14 +115,15 @@ def test_each_missing_entry_is_named(
 @pytest.mark.parametrize(
     ("flow", "kind"),
     [
-        ("exact", GaugeSquash),
+        ("exact", AlignedSquash),
+        ("gauge", GaugeSquash),
         ("radial", RadialSquash),
         ("projection", Projection),
         ("squash", BijectorChain),
         ("none", BoxSquash),
         (PaperChain(max_radius=0.5), BijectorChain),
     ],
-    ids=["exact", "radial", "projection", "squash", "none", "object"],
+    ids=["exact", "gauge", "radial", "projection", "squash", "none", "object"],
 )
 def test_flows_by_name_and_as_objects(
     make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type
@@ -132,10 +134,10 @@ def test_flows_by_name_and_as_objects(
 
 
 def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
-    names = ["exact", "radial", "squash", "projection", "none"]
-    message = re.escape(f"flow: expected one of {names} or a Flow, given 'gauge'")
+    names = ["exact", "gauge", "radial", "squash", "projection", "none"]
+    message = re.escape(f"flow: expected one of {names} or a Flow, given 'gage'")
     with pytest.raises(ValueError, match=message):
-        make_actor(flow="gauge")
+        make_actor(flow="gage")
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, float("nan")])

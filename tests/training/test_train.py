@@ -24,7 +24,7 @@ def form(value: Any) -> Any:
 
 
 ENTROPIES = [
-    *itertools.product(["exact", "radial", "squash", "none"], ["reference", "action"]),
+    *itertools.product(["exact", "gauge", "radial", "squash", "none"], ["reference", "action"]),
     ("projection", "reference"),
 ]
 
@@ -37,7 +37,7 @@ def test_every_flow_trains_and_reports_in_one_form(flow: str, entropy: str, tiny
     assert json.loads((folder.path / "summary.json").read_text()) == summary
     assert summary["steps"] == 192
     assert list(summary["violations"]) == ["obstacle", "battery"]
-    if flow in ("exact", "radial", "projection"):
+    if flow in ("exact", "gauge", "radial", "projection"):
         assert summary["violations"] == {"obstacle": 0, "battery": 0}
 
 
