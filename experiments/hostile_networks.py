@@ -37,7 +37,7 @@ from cnfp_torchrl.modules import flow_head, make_constrained_actor
 from cnfp_torchrl.training.agent import build_actor, build_environment
 
 RESULT = Path(__file__).parent / "results" / "hostile_networks.json"
-FLOWS = ("exact", "radial", "projection")
+FLOWS = ("exact", "gauge", "radial", "projection")
 HUGE = 1e6
 
 Mean = Callable[[Tensor], Tensor]

@@ -39,6 +39,7 @@ LABELS = {
     "exact_action_entropy": Label(
         Look("exact flow, entropy of the action", "#9B84CC", "d"), Kind.EXACT
     ),
+    "gauge": Label(Look("exact flow, boxes radial too", "#2C5985", "h"), Kind.EXACT),
     "radial": Label(Look("radial flow", "#56B4E9", "p"), Kind.EXACT),
     "squash": Label(Look("chain of squashes (the paper's)", "#CC79A7", "s"), Kind.CHAIN),
     "projection": Label(Look("projection", "#009E73", "^"), Kind.PROJECTED),
