@@ -16,7 +16,7 @@ class BijectorChain(Bijector):
 
     The log-determinants add up (paper, eq. normalizing_flow). A chain of squashes is the paper's
     policy: **only the last bijector's set is guaranteed**, because each one moves what those before
-    it placed. `GaugeSquash` is the exact alternative.
+    it placed. `AlignedSquash` is the exact alternative.
 
     Args:
         bijectors: in order of application, the last has the highest priority.

@@ -186,7 +186,8 @@ def spread_labels(
     figure = axes.get_figure(root=True)
     assert figure is not None
     letter = 0.6 * _NAME_SIZE / 72 / figure.get_figwidth()
-    taken: list[tuple[float, float, float]] = []
+    # The marks themselves must stay readable too.
+    taken: list[tuple[float, float, float]] = [(x - 0.015, x + 0.015, y) for x, y in places]
     for i in sorted(range(len(points)), key=lambda i: -places[i][1]):
         (x, level), look = places[i], points[i][2]
         side = -1 if x > 0.6 else 1
