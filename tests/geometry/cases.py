@@ -129,12 +129,12 @@ FAMILIES: dict[str, tuple[Make, tuple[int, ...]]] = {
     "thin-ellipsoid": (_thin_ellipsoid, (6,)),
     "half-space": (_half_space, (1, 2, 32)),
     "polytope": (_polytope, (2, 6, 32)),
-    "zero-rows": (_half_spaces_with_zero_rows, (2, 6)),
     "l1-ball": (_l1_ball, (1, 2, 6, 32)),
     "l1-ball-with-zeros": (_l1_ball_with_zeros, (2, 32)),
     "positive-part": (_positive_part, (1, 2, 6, 32)),
     "visible": (_visible, (1, 2, 3)),
     "sight-or-box": (_visible_or_box, (2,)),
+    "zero-rows": (_half_spaces_with_zero_rows, (2, 6)),
 }
 
 SIZES = (1e-3, 1.0, 1e3)

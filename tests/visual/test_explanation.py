@@ -30,8 +30,8 @@ def only(explanation: Explanation) -> ConstraintEffect:
 
 
 def test_a_constraint_that_binds_is_restrictive() -> None:
-    # tanh(1) = 0.762 in both components; the box ends at 0.5 in the first one. From the centre, 0
-    # (the box is symmetric), the way to the action is cut where its first component is 0.5.
+    # tanh(1) = 0.762 in both components; the box ends at 0.5 in the first one, which is scaled
+    # about the centre, 0 (the box is symmetric): tanh reaches 1 where the wall reaches 0.5.
     walls = {"wall": Box(t([-0.5, -1.0]), t([0.5, 1.0]))}
     explanation = explain(executing(walls, [1.0, 1.0]))
     wall = only(explanation)
@@ -40,11 +40,10 @@ def test_a_constraint_that_binds_is_restrictive() -> None:
     assert wall.share_allowed == pytest.approx(0.5, abs=0.01)
     assert wall.share_outside == 0
     assert wall.before == pytest.approx((0.762, 0.762), abs=0.005)
-    # Retraction divides by the gauge at 0.762: tanh reaches 1 where the wall's way reaches 0.5.
-    assert wall.after == pytest.approx((0.381, 0.381), abs=0.005)
-    assert wall.moved == pytest.approx(2**0.5 * 0.381, abs=0.005)
+    assert wall.after == pytest.approx((0.381, 0.762), abs=0.005)
+    assert wall.moved == pytest.approx(0.381, abs=0.005)
     assert explanation.action == wall.after
-    assert "Wall moved the executed action by 0.53" in explanation.text()
+    assert "Wall moved the executed action by 0.38" in explanation.text()
 
 
 def test_a_constraint_that_does_not_bind_is_permissive() -> None:
