@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.hyperbolic import sum_of_log_sech_squared
+from cnfp_torchrl.bijectors.hyperbolic import log_half_sech
 from cnfp_torchrl.geometry import Box, GeometryError
 
 
@@ -56,12 +56,19 @@ class BoxSquash(Bijector):
             )
         self._middle = (image.low + image.high) / 2
         self._half = (image.high - image.low) / 2
-        # The largest log-determinant, at a latent of zero.
-        self._peak = self._half.log().sum(-1)
+        self._constant = (4 * self._half).log().sum(-1)
+
+    def about(self, centre: Tensor) -> Self:
+        """Return the squash in coordinates about a point ``(*batch, d)``: actions minus it."""
+        squash = type(self).__new__(type(self))
+        Bijector.__init__(squash)
+        squash._middle = self._middle - centre
+        squash._half, squash._constant = self._half, self._constant
+        return squash
 
     @property
     def shape(self) -> torch.Size:
-        return self._half.shape
+        return torch.broadcast_shapes(self._middle.shape, self._half.shape)
 
     @property
     def image(self) -> Box:
@@ -71,11 +78,14 @@ class BoxSquash(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         action = torch.addcmul(self._middle, self._half, latent.tanh())
-        return action, self._peak + sum_of_log_sech_squared(latent)
+        return action, self._log_det(latent)
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         latent = ((action - self._middle) / self._half).atanh()
-        return latent, -(self._peak + sum_of_log_sech_squared(latent))
+        return latent, -self._log_det(latent)
 
     def contains(self, action: Tensor) -> Tensor:
         return (((action - self._middle) / self._half).abs() < 1).all(-1)
+
+    def _log_det(self, latent: Tensor) -> Tensor:
+        return torch.add(self._constant, log_half_sech(latent).sum(-1), alpha=2)

@@ -62,43 +62,26 @@ class Rays:
         self.progress = outer(offset)
         # An offset of zero has no direction, and one so short that gradients, which grow like
         # 1/length, could overflow when squared, has none to speak of. It is given one, so that
-        # nothing becomes NaN. Arithmetic, because torch.where is slow where the mask broadcasts.
-        zero = self.progress < torch.finfo(offset.dtype).tiny ** 0.4
-        self.direction = offset + zero.to(offset.dtype).unsqueeze(-1)
+        # nothing becomes NaN, and a way to the boundary on which no set binds.
+        shortest = torch.finfo(offset.dtype).tiny ** 0.4
+        zero = self.progress < shortest
+        self.direction = offset + zero.unsqueeze(-1)
         self._outer = self.progress.masked_fill(zero, torch.inf)
 
-    def share(self, inner: Tensor) -> Tensor:
-        """Return the share of a ray's way through the outer set that lies in an inner one as well.
+    def contraction(self, inner: Sequence[Gauge]) -> Tensor:
+        """Return by what a way through the outer set is divided to end in the inner ones as well.
 
-        The outer gauge over the larger one of both, and 1 for an offset of zero. Where the inner
-        set does not bind the share is exactly 1, and its gradient 0. An inner gauge of NaN makes
-        the share NaN: a broken constraint must not pass for one that does not bind.
+        The larger one of all gauges over the outer one, and 1 for an offset of zero. Where no inner
+        set binds it is exactly 1, and its gradient 0. An inner gauge of NaN makes it NaN: a broken
+        constraint must not pass for one that does not bind.
 
         Args:
-            inner: the inner set's gauge in `direction`, ``(*stages, *batch)``.
+            inner: the gauges of one or more inner sets about the centre.
         """
-        return (inner / self._outer).clamp(min=1).reciprocal()
-
-    def share_of_all(self, inner: Sequence[Gauge]) -> Tensor:
-        """Return the share that lies in all of some inner sets, given by their gauges."""
-        if not inner:
-            return torch.ones_like(self.progress)
         gauges = [gauge(self.direction) for gauge in inner]
         if len(gauges) == 1:
-            return self.share(gauges[0])
-        # Not one maximum after the other: the gradient of each costs as much as of all at once.
-        return self.share(torch.stack(torch.broadcast_tensors(*gauges)).amax(0))
-
-
-def scale_about(centre: Tensor, point: Tensor, factor: Tensor) -> Tensor:
-    """Return ``centre + factor (point - centre)``.
-
-    Not ``point - (1 - factor) (point - centre)``: in a small region that would round at the scale
-    of the point instead of the region's.
-
-    Args:
-        centre: ``(*batch, d)``.
-        point: ``(*batch, d)``.
-        factor: ``(*batch,)``.
-    """
-    return centre + factor.unsqueeze(-1) * (point - centre)
+            largest = gauges[0]
+        else:
+            # Not one maximum after the other: each gradient costs as much as that of all at once.
+            largest = torch.stack(torch.broadcast_tensors(*gauges)).amax(0)
+        return (largest / self._outer).clamp(min=1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.rays import Rays, scale_about
+from cnfp_torchrl.bijectors.rays import Rays
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.geometry.shapes import broadcast_shape
 
@@ -14,8 +14,8 @@ from cnfp_torchrl.geometry.shapes import broadcast_shape
 class Retraction(Bijector):
     r"""Retract a set radially onto its intersection with another one, about a common centre.
 
-    With :math:`v = x - c`: :math:`a = c + s v`, :math:`s = g_{outer}(v) /
-    \max(g_{outer}(v), g_{inner}(v))`, :math:`\log|\det| = d \log s`.
+    With :math:`v = x - c`: :math:`a = c + v/r`, :math:`r = \max(1, g_{inner}(v)/g_{outer}(v))`,
+    :math:`\log|\det| = -d \log r`.
 
     Args:
         outer: the set that the argument lies in, bounded in every direction. It is not eroded here:
@@ -40,17 +40,20 @@ class Retraction(Bijector):
         return torch.Size((*batch, self._centre.shape[-1]))
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        share = self._share(latent - self._centre)
-        return scale_about(self._centre, latent, share), latent.shape[-1] * share.log()
+        offset = latent - self._centre
+        contraction = self._contraction(offset)
+        action = self._centre + offset / contraction.unsqueeze(-1)
+        return action, -latent.shape[-1] * contraction.log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        share = self._share(action - self._centre)
-        return scale_about(self._centre, action, 1 / share), -action.shape[-1] * share.log()
+        offset = action - self._centre
+        contraction = self._contraction(offset)
+        latent = self._centre + offset * contraction.unsqueeze(-1)
+        return latent, action.shape[-1] * contraction.log()
 
     def contains(self, action: Tensor) -> Tensor:
         rays = Rays(action - self._centre, self._outer_gauge)
-        return rays.progress < rays.share(self._inner_gauge(rays.direction))
+        return rays.progress * rays.contraction([self._inner_gauge]) < 1
 
-    def _share(self, offset: Tensor) -> Tensor:
-        rays = Rays(offset, self._outer_gauge)
-        return rays.share(self._inner_gauge(rays.direction))
+    def _contraction(self, offset: Tensor) -> Tensor:
+        return Rays(offset, self._outer_gauge).contraction([self._inner_gauge])

@@ -54,10 +54,14 @@ class Flow(ABC):
         """
 
 
-class ExactFlow(Flow):
-    """A tanh squash into the action bounds, then retractions into the intersection (default)."""
+class RegionFlow(Flow):
+    """A bijector onto the intersection of the action bounds and all active sets."""
 
     is_exact = True
+
+    @abstractmethod
+    def onto(self, region: Region) -> Bijector:
+        """Return the bijector onto a region, which comes checked."""
 
     def __call__(
         self,
@@ -65,43 +69,31 @@ class ExactFlow(Flow):
         sets: Sequence[ConstraintSet],
         centre: Tensor | None,
         active: Tensor | None,
-    ) -> AlignedSquash:
+    ) -> Bijector:
         assert centre is not None
         region = Region((bounds, *sets), centre, active, validate_args=False)
+        return self.onto(region)
+
+
+class ExactFlow(RegionFlow):
+    """A tanh squash into the action bounds, then retractions into the intersection (default)."""
+
+    def onto(self, region: Region) -> AlignedSquash:
         return AlignedSquash(region, validate_args=False)
 
 
-class GaugeFlow(Flow):
+class GaugeFlow(RegionFlow):
     """The exact flow with every retraction radial, of boxes too."""
 
-    is_exact = True
-
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
-        active: Tensor | None,
-    ) -> GaugeSquash:
-        assert centre is not None
-        region = Region((bounds, *sets), centre, active, validate_args=False)
+    def onto(self, region: Region) -> GaugeSquash:
         return GaugeSquash(region, validate_args=False)
 
 
-class RadialFlow(Flow):
+class RadialFlow(RegionFlow):
     """A radial squash straight onto the intersection; for one or two action dimensions."""
 
-    is_exact = True
-
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
-        active: Tensor | None,
-    ) -> RadialSquash:
-        assert centre is not None
-        return RadialSquash(Region((bounds, *sets), centre, active, validate_args=False))
+    def onto(self, region: Region) -> RadialSquash:
+        return RadialSquash(region)
 
 
 class PaperChain(Flow):
@@ -137,7 +129,7 @@ class PaperChain(Flow):
         )
 
 
-class ProjectionFlow(Flow):
+class ProjectionFlow(RegionFlow):
     """A baseline: the tanh-squashed Gaussian's action, projected onto the intersection.
 
     No bijection, so that no densities exist (`cnfp_torchrl.bijectors.Projection`). For boxes, balls
@@ -147,7 +139,6 @@ class ProjectionFlow(Flow):
         rounds: of Dykstra's algorithm, for other intersections; what it leaves is retracted.
     """
 
-    is_exact = True
     has_density = False
 
     def __init__(self, rounds: int = 50) -> None:
@@ -155,15 +146,7 @@ class ProjectionFlow(Flow):
             raise ValueError(f"rounds: expected a number >= 1, given {rounds}")
         self.rounds = rounds
 
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
-        active: Tensor | None,
-    ) -> Projection:
-        assert centre is not None
-        region = Region((bounds, *sets), centre, active, validate_args=False)
+    def onto(self, region: Region) -> Projection:
         return Projection(region, rounds=self.rounds, validate_args=False)
 
 

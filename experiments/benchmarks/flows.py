@@ -31,7 +31,7 @@ from torch.func import jacrev, vmap
 from torch.utils.benchmark import Timer
 from torchrl.modules import TanhNormal
 
-from cnfp_torchrl.bijectors import GaugeSquash, RadialSquash
+from cnfp_torchrl.bijectors import AlignedSquash, RadialSquash
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
@@ -96,7 +96,7 @@ def tanh_normal(p: Problem) -> TanhNormal:
 
 def exact_flow(p: Problem) -> ConstrainedFlow:
     """Return the exact flow."""
-    return ConstrainedFlow(p.base(), GaugeSquash(p.region(), validate_args=False))
+    return ConstrainedFlow(p.base(), AlignedSquash(p.region(), validate_args=False))
 
 
 def radial_full_jacobian(p: Problem) -> Sample:

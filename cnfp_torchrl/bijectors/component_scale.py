@@ -1,0 +1,47 @@
+"""Scaling of offsets component by component, by one factor on each side of the centre."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry import Box
+
+
+class ComponentScale:
+    r"""The bijection :math:`v_i \mapsto v_i \rho_i`, with one factor for each sign of a component.
+
+    Args:
+        above: factors of positive components, ``(*batch, d)``, positive.
+        below: factors of negative components, ``(*batch, d)``, positive.
+    """
+
+    def __init__(self, above: Tensor, below: Tensor) -> None:
+        self._above, self._below = above, below
+        log_above, self._log_below = above.log(), below.log()
+        self._log_difference = log_above - self._log_below
+
+    @classmethod
+    def between(cls, outer: Box, inner: Box) -> Self:
+        """Return the scale that takes one box onto another, each with 0 inside."""
+        return cls(inner.high / outer.high, inner.low / outer.low)
+
+    def forward(self, offset: Tensor) -> Tensor:
+        """Return the scaled offset ``(*batch, d)``."""
+        return _scaled(offset, self._above, self._below)
+
+    def inverse(self, scaled: Tensor) -> Tensor:
+        """Return the offset of a scaled one."""
+        return _scaled(scaled, 1 / self._above, 1 / self._below)
+
+    def log_det(self, offset: Tensor) -> Tensor:
+        r"""Return :math:`\sum_i \log \rho_i`, ``(*batch,)``."""
+        ahead = (offset > 0).to(offset.dtype)
+        return torch.addcmul(self._log_below, ahead, self._log_difference).sum(-1)
+
+
+def _scaled(offset: Tensor, above: Tensor, below: Tensor) -> Tensor:
+    ahead = offset.relu()
+    return torch.addcmul(ahead * above, offset - ahead, below)
