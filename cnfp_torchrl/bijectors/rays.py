@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import threshold
 
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.geometry.constraint_set import Gauge
@@ -64,9 +65,9 @@ class Rays:
         # 1/length, could overflow when squared, has none to speak of. It is given one, so that
         # nothing becomes NaN, and a way to the boundary on which no set binds.
         shortest = torch.finfo(offset.dtype).tiny ** 0.4
-        zero = self.progress < shortest
+        zero = self.progress <= shortest
         self.direction = offset + zero.unsqueeze(-1)
-        self._outer = self.progress.masked_fill(zero, torch.inf)
+        self._outer = threshold(self.progress, shortest, torch.inf)
 
     def contraction(self, inner: Sequence[Gauge]) -> Tensor:
         """Return by what a way through the outer set is divided to end in the inner ones as well.
@@ -84,4 +85,5 @@ class Rays:
         else:
             # Not one maximum after the other: each gradient costs as much as that of all at once.
             largest = torch.stack(torch.broadcast_tensors(*gauges)).amax(0)
-        return (largest / self._outer).clamp(min=1)
+        # The larger one of it and 1; the gradient of clamp takes more passes.
+        return threshold(largest / self._outer, 1, 1)

@@ -72,8 +72,7 @@ def _effect(
     share_allowed: float | None,
     fact: str | None,
 ) -> ConstraintEffect:
-    allowed = snapshot.region.sets[index]
-    samples = snapshot.stages[-1].samples
+    allowed, contained = snapshot.region.sets[index], snapshot.contained[index]
     before = after = moved = share_moved = None
     if stage is not None and path is not None:
         after = path[stage]
@@ -88,7 +87,7 @@ def _effect(
     effect: Effect = "restrictive"
     if snapshot.is_exact and not snapshot.is_active(index):
         effect = "dropped"
-    elif not bool(allowed.contains(action)):
+    elif not bool(contained[snapshot.followed]):
         effect = "broken"
     elif (share_moved == 0 and not moved) if snapshot.is_exact else share_allowed == 1:
         effect = "permissive"
@@ -99,7 +98,7 @@ def _effect(
         after=None if after is None else _plain(after),
         moved=moved,
         share_moved=share_moved,
-        share_outside=_share(~allowed.contains(samples)),
+        share_outside=_share(~contained),
         share_allowed=share_allowed,
         slack=float(allowed.with_fields(lambda field, _: field.double()).slack(action.double())),
         fact=fact,

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import BatteryGeometry
@@ -53,22 +54,22 @@ class PointNavFacts:
         goal = state.get(self._key)[..., 3:]
         to_goal = float(torch.linalg.vector_norm(goal - position))
         x, y = position.tolist()
+        battery = int(charge)
         situation = (
-            f"At ({x:.3f}, {y:.3f}), battery {int(charge)} %, goal {to_goal:.3f} away "
+            f"At ({x:.3f}, {y:.3f}), battery {battery} %, goal {to_goal:.3f} away "
             f"({to_goal / layout.step_length:.1f} steps)."
         )
         said = {
-            geometry.name: self._battery(state)
+            geometry.name: self._battery(position, battery)
             if isinstance(geometry, BatteryGeometry)
-            else self._obstacle(state)
+            else self._obstacle(position)
             for geometry in self._geometries
         }
         return Facts(situation, said)
 
-    def _obstacle(self, state: TensorDictBase) -> str:
+    def _obstacle(self, position: Tensor) -> str:
         layout = self._path.layout
-        position, _ = read_observation(state, self._key)
-        wall = float(layout.wall - position.abs().max())
+        wall = layout.wall - max(map(abs, position.tolist()))
         said = f"the nearest wall is {_length(wall, layout.step_length)} away."
         if not layout.rectangles:
             return f"No rectangles; {said}"
@@ -78,13 +79,12 @@ class PointNavFacts:
             return f"The agent touches a rectangle; {said}"
         return f"The nearest rectangle is {_length(distance, layout.step_length)} away, {said}"
 
-    def _battery(self, state: TensorDictBase) -> str:
+    def _battery(self, position: Tensor, battery: int) -> str:
         layout = self._path.layout
-        position, battery = read_observation(state, self._key)
         way = self._path.to_station(position)
         length = float(torch.linalg.vector_norm(way.waypoint - position) + way.rest)
         needed = max(math.ceil((length - layout.zone_radius) / layout.step_length), 0)
-        left = int(battery) - layout.battery_threshold
+        left = battery - layout.battery_threshold
         if left < 0:
             said = f"The charge is below the threshold of {layout.battery_threshold} %"
         else:

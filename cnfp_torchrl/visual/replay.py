@@ -14,7 +14,8 @@ from cnfp_torchrl.bijectors import BijectorChain
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.modules.constraint_bijector import require
-from cnfp_torchrl.visual.snapshot import FlowSnapshot, Stage, snapshot_of, stage_bijector
+from cnfp_torchrl.visual.snapshot import FlowSnapshot, snapshot_of
+from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 
 @torch.no_grad()
@@ -60,33 +61,32 @@ def in_float64(region: Region) -> Region:
 
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     """Return the snapshot with the executed action before all samples."""
-    region, last = in_float64(snapshot.region), snapshot.stages[-1]
-    bijector = stage_bijector(snapshot.flow, region, last.applied)
+    region = in_float64(snapshot.region)
+    staged = StagedFlow(snapshot.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
-    latent = bijector.inverse_and_log_det(given)[0]
-    path, log_dets = bijector.stages(latent)
-    if isinstance(bijector, BijectorChain):
-        path = _backwards(bijector, given)
+    latent = staged.inverse(given[None])[0][-1]
+    path, log_dets = staged.forward(latent)
+    path = path.squeeze(1)
+    if isinstance(staged.last, BijectorChain):
+        path = _backwards(staged.last, given)
     normal = Normal(snapshot.loc.double(), snapshot.scale.double(), validate_args=False)
     latent_log_density = Independent(normal, 1, validate_args=False).log_prob(latent)
-    log_density = latent_log_density - log_dets
     is_recovered = bool(path.isfinite().all())
     if not is_recovered:
         path = given.expand(len(snapshot.stages), -1)
+    path = torch.cat([path[:-1], given[None]])
+    samples = _before(path[:, None], torch.stack([stage.samples for stage in snapshot.stages]))
+    log_density = _before(
+        latent_log_density - log_dets, torch.stack([each.log_density for each in snapshot.stages])
+    )
     stages = tuple(
-        Stage(
-            stage.name,
-            _before(action if stage is last else path[i], stage.samples),
-            _before(log_density[i], stage.log_density),
-            stage.applied,
-            stage.active,
-        )
+        replace(stage, samples=samples[i], log_density=log_density[i])
         for i, stage in enumerate(snapshot.stages)
     )
     return replace(
         snapshot,
-        latents=_before(latent, snapshot.latents),
-        latent_log_density=_before(latent_log_density, snapshot.latent_log_density),
+        latents=_before(latent, snapshot.latents, 0),
+        latent_log_density=_before(latent_log_density, snapshot.latent_log_density, 0),
         stages=stages,
         is_recovered=is_recovered,
     )
@@ -104,5 +104,5 @@ def _backwards(chain: BijectorChain, action: Tensor) -> Tensor:
     return torch.stack(points[::-1])
 
 
-def _before(first: Tensor, rest: Tensor) -> Tensor:
-    return torch.cat([first.to(rest).unsqueeze(0), rest])
+def _before(first: Tensor, rest: Tensor, dim: int = 1) -> Tensor:
+    return torch.cat([first.to(rest), rest], dim)

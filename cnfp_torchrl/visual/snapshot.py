@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from tensordict import TensorDictBase
@@ -12,10 +13,10 @@ from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.geometry import ConstraintSet, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY
+from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class FlowSnapshot:
         constraint_names: of ``region.sets[1:]``, in order of application.
         through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
+        log_densities: of further actions ``(n, d)`` after each stage, ``(stages, n)``; -inf where
+            there is none.
         flow: how the sets are combined.
         followed: index of the sample whose path through the stages is drawn.
         is_recovered: whether the path of an executed action is known; an action outside the flow's
@@ -69,6 +72,7 @@ class FlowSnapshot:
     region: Region
     constraint_names: tuple[str, ...]
     through_stages: Callable[[Tensor], tuple[Tensor, Tensor]]
+    log_densities: Callable[[Tensor], Tensor]
     flow: Flow
     followed: int = 0
     is_recovered: bool = True
@@ -92,15 +96,23 @@ class FlowSnapshot:
         """Tell whether ``region.sets[index]`` holds in this state."""
         return _is_active(self.region, index)
 
+    @cached_property
+    def contained(self) -> Tensor:
+        """Which samples of the last stage each set contains, dropped ones too, ``(K + 1, n)``."""
+        samples = self.stages[-1].samples
+        return torch.stack([each.contains(samples) for each in self.region.sets])
+
     def outside(self, stage: int) -> Tensor:
         """Tell, with zero tolerance, which samples lie outside the active sets so far, ``(n,)``.
 
         After the last stage, whose samples are executed, every set counts, applied or not.
         """
+        if stage + 1 == len(self.stages):
+            active = [k for k in range(len(self.region.sets)) if self.is_active(k)]
+            return ~self.contained[active].all(0)
         samples = self.stages[stage].samples
-        last = stage + 1 == len(self.stages)
         outside = torch.zeros(samples.shape[:-1], dtype=torch.bool)
-        for index in range(len(self.region.sets)) if last else self.stages[stage].applied:
+        for index in self.stages[stage].applied:
             if self.is_active(index):
                 outside |= ~self.region.sets[index].contains(samples)
         return outside
@@ -169,19 +181,33 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
     region = _region(head, state)
     applied = _applied(head.stage_names, head.order)
-    bijector = stage_bijector(head.flow, region, applied[-1][1])
+    staged = StagedFlow(head.flow, region, [sets for _, sets in applied])
 
     @torch.no_grad()
     def through_stages(latents: Tensor) -> tuple[Tensor, Tensor]:
         given = latents.to(loc)
-        actions, log_dets = bijector.stages(given)
+        actions, log_dets = staged.forward(given)
         return actions.cpu(), (base.log_prob(given) - log_dets).cpu()
 
+    @torch.no_grad()
+    def log_densities(actions: Tensor) -> Tensor:
+        latents, log_dets = staged.inverse(actions.to(loc))
+        # Actions outside the image have no latent, and the inverse of tanh says so by its NaN.
+        outside = ~latents.isfinite().all(-1)
+        return (base.log_prob(latents) + log_dets).masked_fill(outside, -torch.inf).cpu()
+
     latents = loc + scale * noise.to(loc)
-    actions, log_density = through_stages(latents)
+    latent_log_density = base.log_prob(latents).cpu()
+    actions, log_dets = (each.cpu() for each in staged.forward(latents))
     on_host = _on_host(region)
     stages = tuple(
-        Stage(name, actions[i], log_density[i], sets, _is_active(on_host, sets[-1]))
+        Stage(
+            name,
+            actions[i],
+            latent_log_density - log_dets[i],
+            sets,
+            _is_active(on_host, sets[-1]),
+        )
         for i, (name, sets) in enumerate(applied)
     )
     return FlowSnapshot(
@@ -189,27 +215,14 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
         loc=loc.cpu(),
         scale=scale.cpu(),
         latents=latents.cpu(),
-        latent_log_density=base.log_prob(latents).cpu(),
+        latent_log_density=latent_log_density,
         stages=stages,
         region=on_host,
         constraint_names=tuple(head.order),
         through_stages=through_stages,
+        log_densities=log_densities,
         flow=head.flow,
     )
-
-
-def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Bijector:
-    """Return the bijector of a flow up to a stage.
-
-    Args:
-        flow: how the sets are combined.
-        region: of one state.
-        applied: indices into the region's sets of those applied so far.
-    """
-    constraints = [k for k in applied if k > 0]
-    sets = [region.sets[k] for k in constraints]
-    active = None if region.active is None else region.active[..., [0, *constraints]]
-    return flow(region.bounds, sets, region.centre, active)
 
 
 def _region(head: ConstrainedFlowModule, state: TensorDictBase) -> Region:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -133,7 +134,8 @@ def table(rows: dict[str, dict[str, Any]], setting: dict[str, Any]) -> str:
     lines += [
         "",
         f"Without a stream, Rerun is imported: {setting['imported_when_off']}. On a busy machine a "
-        f"step costs more; a fixed piece of work beside it took {setting['reference_ms']} ms.",
+        f"step costs more: the load was {setting['load']:.1f} on {setting['processors']} "
+        f"processors, and a fixed piece of work beside it took {setting['reference_ms']} ms.",
         "",
     ]
     return "\n".join(lines)
@@ -166,6 +168,8 @@ def main() -> None:
         "steps": steps,
         "repeats": repeats,
         "reference_ms": round(statistics.median(references), 2),
+        "load": os.getloadavg()[0],
+        "processors": os.cpu_count(),
         "imported_when_off": off.stdout.strip(),
         "python": platform.python_version(),
         "processor": platform.machine(),

@@ -9,11 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Normal
 
-from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.visual.outlines import Line
-from cnfp_torchrl.visual.snapshot import FlowSnapshot, stage_bijector
+from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 Heat: TypeAlias = NDArray[np.uint8]
 
@@ -34,7 +32,8 @@ class ActionGrid:
     def __init__(self, limits: Sequence[tuple[float, float]], cells: int) -> None:
         share = (torch.arange(cells) + 0.5) / cells
         axes = [low + (high - low) * share for low, high in limits]
-        self.actions = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)
+        # One component after the other in memory: to add up two neighbours takes thrice as long.
+        self.actions = torch.stack(torch.meshgrid(*axes, indexing="xy")).movedim(0, -1)
         """``(cells, d)`` or, the second component first, ``(cells, cells, d)``."""
 
     def log_densities(self, snapshot: FlowSnapshot) -> Tensor:
@@ -45,27 +44,8 @@ class ActionGrid:
         Args:
             snapshot: the policy in a state.
         """
-        region = snapshot.region
-        normal = Normal(snapshot.loc, snapshot.scale, validate_args=False)
-        base = Independent(normal, 1, validate_args=False)
-        stages = [stage.applied for stage in snapshot.stages]
-        if not snapshot.is_exact:
-            bijectors = [stage_bijector(snapshot.flow, region, applied) for applied in stages]
-            return torch.stack([self._log_density(base, each) for each in bijectors])
-        # All stages in one pass: to an exact flow, a set not yet applied is one that is not active.
-        applied = torch.tensor([[k in each for k in range(len(region.sets))] for each in stages])
-        active = applied if region.active is None else applied & region.active
-        active = active.reshape(len(stages), *(1,) * (self.actions.ndim - 1), -1)
-        bijector = snapshot.flow(region.bounds, region.sets[1:], region.centre, active)
-        return self._log_density(base, bijector, len(stages))
-
-    def _log_density(self, base: Distribution, bijector: Bijector, *batch: int) -> Tensor:
-        actions = self.actions.expand(*batch, *self.actions.shape)
-        latent, log_det = bijector.inverse_and_log_det(actions)
-        # Actions outside the image have no latent, and the inverse of tanh says so by its NaN; the
-        # parameters of the flow were found finite before.
-        outside = ~latent.isfinite().all(-1)
-        return (base.log_prob(latent) + log_det).masked_fill(outside, -torch.inf)
+        given = self.actions.reshape(-1, snapshot.dim)
+        return snapshot.log_densities(given).unflatten(1, self.actions.shape[:-1])
 
     def curves(self, log_density: Tensor) -> list[Line]:
         """Return actions and densities, in one dimension, of each stage, ``(cells, 2)``.

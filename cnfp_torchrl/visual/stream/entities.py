@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-_POINT = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
+from cnfp_torchrl.visual.stream import components
+
 _END: NDArray[np.int32] = np.zeros(1, dtype=np.int32)
 _NOTHING: NDArray[np.float32] = np.zeros((0, 2), dtype=np.float32)
-_STRIP = pa.list_(pa.field("item", _POINT, nullable=False))
 
 
 class Entities:
@@ -27,7 +26,7 @@ class Entities:
 
     def __init__(self, stream: rr.RecordingStream, root: str) -> None:
         self._stream, self._root = stream, root
-        self._last: dict[str, tuple[NDArray[np.int32], NDArray[np.float32]]] = {}
+        self._last: dict[str, tuple[bytes, bytes]] = {}
 
     def style(self, name: str, *archetypes: rr.AsComponents) -> None:
         """Log what never changes; such as has no positions, which would hide those of the steps.
@@ -42,23 +41,41 @@ class Entities:
         """Log points ``(n, 2)``."""
         given = np.asarray(positions, dtype=np.float32).reshape(-1, 2)
         if self._is_new(name, _END, given):
-            self.log(name, rr.Points2D.from_fields(positions=given))
+            self.log(name, components.points(given))
 
     def lines(self, name: str, strips: Sequence[ArrayLike] | NDArray[np.float32]) -> None:
         """Log lines, each ``(points, 2)``."""
         ends, flat = _joined(strips)
         if self._is_new(name, ends, flat):
-            self.log(name, rr.LineStrips2D.from_fields(strips=_arrow(ends, flat)))
+            self.log(name, components.strips(ends, flat))
 
-    def log(self, name: str, archetype: rr.AsComponents) -> None:
+    def path(self, name: str, positions: ArrayLike) -> None:
+        """Log a path ``(n, 2)``: a line where there is one, and its points, the last one twice.
+
+        That is a disc, and a dark one below it for its rim.
+        """
+        given = np.asarray(positions, dtype=np.float32)
+        if self._is_new(name, _END, given):
+            values = components.points(np.concatenate([given, given[-1:]]))
+            if len(given) > 1:
+                ends = np.array([0, len(given)], dtype=np.int32)
+                values += components.strips(ends, given)
+            self.log(name, values)
+
+    def arrow(self, name: str, origin: ArrayLike, vector: ArrayLike) -> None:
+        """Log an arrow, origin and vector ``(2,)``."""
+        ends = (np.asarray(end, dtype=np.float32) for end in (origin, vector))
+        self.log(name, components.arrows(*ends))
+
+    def log(self, name: str, values: components.Logged) -> None:
         """Log anything else."""
-        self._stream.log(f"{self._root}/{name}", archetype)
+        self._stream.log(f"{self._root}/{name}", values)
 
     def _is_new(self, name: str, ends: NDArray[np.int32], flat: NDArray[np.float32]) -> bool:
         # An entity that was never logged shows nothing, as an empty one does.
-        last_ends, last = self._last.get(name, (_END, _NOTHING))
-        self._last[name] = ends, flat
-        return not (np.array_equal(last, flat) and np.array_equal(last_ends, ends))
+        last = self._last.get(name, (_END.tobytes(), b""))
+        now = self._last[name] = ends.tobytes(), flat.tobytes()
+        return now != last
 
 
 def _joined(
@@ -73,10 +90,4 @@ def _joined(
         return _END, _NOTHING
     given = [np.asarray(strip, dtype=np.float32) for strip in strips]
     ends = np.cumsum([0, *map(len, given)], dtype=np.int32)
-    return ends, np.concatenate([each.reshape(-1, 2) for each in given])
-
-
-def _arrow(ends: NDArray[np.int32], flat: NDArray[np.float32]) -> pa.Array:
-    """Return lines in Rerun's own format; its converter takes ten times as long for many lines."""
-    points = pa.FixedSizeListArray.from_arrays(pa.array(flat.reshape(-1)), type=_POINT)
-    return pa.ListArray.from_arrays(pa.array(ends), points, type=_STRIP)
+    return ends, np.concatenate(given)

@@ -65,10 +65,7 @@ class LineView:
         ends = self._level(outlines.of_intersection(stage.applied), 0.0)
         self._entities.lines("set_so_far", [_post(x) for x in ends[:, 0]])
         path = snapshot.path()[: self.stage + 1].numpy()
-        path = np.concatenate([path, np.zeros_like(path)], axis=-1)
-        self._entities.lines("executed/path", [path] if self.stage > 0 else [])
-        # The last point twice: a disc, and a dark one below it for its rim.
-        self._entities.points("executed/points", np.concatenate([path, path[-1:]]))
+        self._entities.path("executed", np.concatenate([path, np.zeros_like(path)], axis=-1))
 
     def _level(self, ends: Line, height: float) -> Line:
         """Return the ends of an interval as points at a height, within the view."""
@@ -83,24 +80,12 @@ class LineView:
         )
         low, high = self._middle - self._half, self._middle + self._half
         frame = [_post(low), _post(high), np.array([(low, 0.0), (high, 0.0)])]
-        self._entities.style(
-            "bounds",
-            rr.LineStrips2D(frame, colors=style.FAINT, radii=style.THIN, draw_order=0),
-        )
-        lines, points = rr.LineStrips2D.from_fields, rr.Points2D.from_fields
-        for name, archetype in {
-            "density": lines(colors=style.CURVE, radii=style.LINE, draw_order=5),
-            "samples": points(colors=style.SAMPLE, radii=style.DOT, draw_order=10),
-            "samples_outside": points(colors=style.BREAKS, radii=style.BAD_DOT, draw_order=11),
-            "set_so_far": lines(colors=style.PALE, radii=style.THIN, draw_order=21),
-            "executed/path": lines(colors=style.EXECUTED, radii=style.LINE, draw_order=30),
-            "executed/points": points(
-                colors=[style.EXECUTED] * self.stage + [style.BACKGROUND, style.EXECUTED],
-                radii=[style.KNOT] * self.stage + [style.MARK, style.MARK_INSIDE],
-                draw_order=31,
-            ),
-        }.items():
-            self._entities.style(name, archetype)
+        self._entities.style("bounds", rr.LineStrips2D.from_fields(strips=frame))
+        for name, archetypes in style.stage_styles(self.stage).items():
+            self._entities.style(name, *archetypes)
+        lines = rr.LineStrips2D.from_fields
+        curve = lines(colors=style.CURVE, radii=style.LINE, draw_order=5)
+        self._entities.style("density", curve)
         for k, name in enumerate(scene.constraints, start=1):
             colour = rgb(scene.colours[name])
             self._entities.style(f"sets/{k}", lines(colors=colour, radii=style.BAR, draw_order=20))

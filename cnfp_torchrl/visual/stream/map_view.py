@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from array import array
 
 import numpy as np
 import rerun as rr
@@ -35,17 +35,18 @@ class MapView:
     def __init__(self, stream: rr.RecordingStream, scene: FlowScene, layout: Layout) -> None:
         self._entities = Entities(stream, MAP)
         self._scene, self._layout = scene, layout
-        self._trail: deque[list[float]] = deque(maxlen=_LONGEST_TRAIL)
+        self._trail = array("d")
         self._log_map()
         self._log_styles()
 
     def follow(self, transition: TensorDictBase) -> None:
         """Remember where the agent is, for its trail; of every step, logged or not."""
-        self._trail.append(transition["observation"][:2].tolist())
+        self._trail.extend(transition["observation"][:2].tolist())
+        del self._trail[: -2 * _LONGEST_TRAIL]
 
     def end_episode(self) -> None:
         """Forget the trail."""
-        self._trail.clear()
+        self._trail = array("d")
 
     def log(self, snapshot: FlowSnapshot, outlines: RayOutlines) -> None:
         """Log one step.
@@ -71,8 +72,8 @@ class MapView:
         entities.lines("allowed_moves", placed(within(allowed, view)))
         moves = step * snapshot.stages[-1].samples.numpy()
         entities.points("targets", place + moves[1 : 1 + _TARGETS])
-        entities.log("move", rr.Arrows2D.from_fields(origins=place[None], vectors=moves[:1]))
-        trail = np.array(self._trail)
+        entities.arrow("move", place, moves[0])
+        trail = np.array(self._trail).reshape(-1, 2)
         entities.lines("trail", [trail[:-_RECENT], trail[-_RECENT - 1 :]])
         entities.points("goal", [goal, goal])
         entities.points("agent", [place, place])

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from cnfp_torchrl.geometry import Box, Region
 from cnfp_torchrl.visual.outlines import Line, View
 
-_RAYS = 360
+_ANGLES = np.linspace(-np.pi, np.pi, 361)
 _FAR = 1e5
 """A set without an end in some direction is drawn up to here, well beyond any view."""
 _STRAIGHT, _SAME = 1e-9, 1e-6
@@ -31,39 +30,42 @@ class RayOutlines:
 
     def __init__(self, region: Region, components: Sequence[int]) -> None:
         chosen = list(components)
-        self._centre = region.centre[chosen]
+        self._centre = region.centre[chosen].numpy()
         self._ray = _rays(self._centre, _corners(region, chosen))
-        direction = self._ray.new_zeros(len(self._ray), region.centre.shape[-1])
-        direction[:, chosen] = self._ray
+        direction = region.centre.new_zeros(region.centre.shape[-1], len(self._ray)).T
+        direction[:, chosen] = torch.from_numpy(self._ray)
         self._gauges = [
-            each.gauge(direction, region.centre)
+            each.gauge(direction, region.centre).numpy()
             if region.active is None or bool(region.active[k])
             else None
             for k, each in enumerate(region.sets)
         ]
+        self._boundaries: dict[tuple[int, ...], Line] = {}
 
     def of_set(self, index: int) -> Line | None:
         """Return the closed boundary of one set, ``(points, m)``; None for a dropped one."""
-        gauge = self._gauges[index]
-        return None if gauge is None else self._boundary(gauge)
+        return None if self._gauges[index] is None else self.of_intersection((index,))
 
     def of_intersection(self, applied: Sequence[int]) -> Line:
         """Return the closed boundary of the intersection of those sets that hold."""
-        gauges = [gauge for k in applied if (gauge := self._gauges[k]) is not None]
-        return self._boundary(torch.stack([self._ray.new_zeros(len(self._ray)), *gauges]).amax(0))
-
-    def _boundary(self, gauge: Tensor) -> Line:
-        boundary: Line = (self._centre + self._ray / gauge.clamp(min=1 / _FAR)[:, None]).numpy()
-        return boundary
+        key = tuple(applied)
+        if key not in self._boundaries:
+            gauges = [gauge for k in key if (gauge := self._gauges[k]) is not None]
+            largest = np.maximum.reduce([np.full(len(self._ray), 1 / _FAR), *gauges])
+            self._boundaries[key] = self._centre + self._ray / largest[:, None]
+        return self._boundaries[key]
 
 
 def within(line: Line, view: View) -> list[Line]:
     """Return the pieces of a line ``(points, 2)`` that lie in a view, without needless points."""
     x_low, x_high, y_low, y_high = view
-    low, high = np.array([x_low, y_low]), np.array([x_high, y_high])
-    inside: NDArray[np.bool_] = np.asarray(((line >= low) & (line <= high)).all(-1))
+    x, y = line.T
+    inside: NDArray[np.bool_] = (x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high)
     if inside.all():
         return [_simplified(line)]
+    if not inside.any():
+        return []
+    low, high = np.array([x_low, y_low]), np.array([x_high, y_high])
     if np.array_equal(line[0], line[-1]):
         # A closed line has no ends of its own: it begins where it is out of view.
         start = int(np.argmin(inside))
@@ -96,32 +98,33 @@ def _simplified(line: Line) -> Line:
     """Return the line without points in the middle of straight parts."""
     if len(line) < 3:
         return line
-    before, after = line[1:-1] - line[:-2], line[2:] - line[1:-1]
-    bends = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > _STRAIGHT
-    return line[np.concatenate([[True], bends, [True]])]
+    x, y = line.T
+    dx, dy = x[1:] - x[:-1], y[1:] - y[:-1]
+    keep = np.ones(len(line), dtype=bool)
+    keep[1:-1] = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:]) > _STRAIGHT
+    return line[keep]
 
 
-def _rays(centre: Tensor, corners: Tensor) -> Tensor:
+def _rays(centre: Line, corners: Line) -> Line:
     """Return directions all around, the first one again at the end, and those of the corners."""
     if len(centre) == 1:
-        return centre.new_tensor([[-1.0], [1.0]])
-    angle = torch.linspace(-torch.pi, torch.pi, _RAYS + 1, dtype=centre.dtype)
-    x, y = (corners - centre).unbind(-1)
-    angle = torch.cat([angle, torch.atan2(y, x)]).sort().values
+        return np.array([[-1.0], [1.0]])
+    x, y = (corners - centre).T
+    angle = np.sort(np.concatenate([_ANGLES, np.arctan2(y, x)]))
     # Two equal rays would hide the corner between them from `_simplified`.
-    angle = angle[torch.cat([angle.new_ones(1), angle.diff()]) > _SAME]
-    ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    angle = angle[np.diff(angle, prepend=-np.inf) > _SAME]
+    ray = np.stack([np.cos(angle), np.sin(angle)]).T
     ray[-1] = ray[0]
     return ray
 
 
-def _corners(region: Region, chosen: list[int]) -> Tensor:
+def _corners(region: Region, chosen: list[int]) -> Line:
     """Return the corners of boxes, which rays at equal angles would cut off, ``(corners, m)``."""
     ends = [
-        torch.stack([each.low[chosen], each.high[chosen]])
+        (each.low.numpy()[chosen], each.high.numpy()[chosen])
         for each in region.sets
         if isinstance(each, Box) and len(chosen) == 2
     ]
-    corners = [torch.cartesian_prod(*each.T) for each in ends]
-    found = torch.cat([region.centre.new_zeros(0, len(chosen)), *corners])
-    return found[found.isfinite().all(-1)]
+    corners = [(x, y) for low, high in ends for x in (low[0], high[0]) for y in (low[1], high[1])]
+    found = np.array(corners).reshape(-1, len(chosen))
+    return found[np.isfinite(found).all(-1)]

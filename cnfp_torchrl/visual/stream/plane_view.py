@@ -10,7 +10,7 @@ from rerun.components import ImageFormat
 from cnfp_torchrl.visual.colours import rgb
 from cnfp_torchrl.visual.outlines import set_outline
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
-from cnfp_torchrl.visual.stream import style
+from cnfp_torchrl.visual.stream import components, style
 from cnfp_torchrl.visual.stream.density import Heat
 from cnfp_torchrl.visual.stream.entities import Entities
 from cnfp_torchrl.visual.stream.outlines import RayOutlines, within
@@ -60,7 +60,7 @@ class PlaneView:
         looked_at = self._is_last or not snapshot.is_exact
         outside = snapshot.outside(self.stage)[1:].numpy() if looked_at else np.zeros(0, dtype=bool)
         if heat is not None:
-            entities.log("density", rr.DepthImage.from_fields(buffer=heat.tobytes()))
+            entities.log("density", components.pixels(heat))
         if self.stage > 0:
             before = self._shown(snapshot, self.stage - 1)[1 : 1 + _TRACKS]
             tracks = np.stack([before, samples[:_TRACKS]], axis=1)
@@ -70,9 +70,7 @@ class PlaneView:
         entities.points("samples_outside", samples[outside] if any_outside else samples[:0])
         self._log_sets(snapshot, outlines)
         path = np.stack([self._shown(snapshot, i)[0] for i in range(self.stage + 1)])
-        entities.lines("executed/path", [path] if self.stage > 0 else [])
-        # The last point twice: a disc, and a dark one below it for its rim.
-        entities.points("executed/points", np.concatenate([path, path[-1:]]))
+        entities.path("executed", path)
 
     def _shown(self, snapshot: FlowSnapshot, stage: int) -> NDArray[np.float32]:
         """Return the shown components of all samples after a stage, ``(1 + n, 2)``."""
@@ -112,8 +110,7 @@ class PlaneView:
         )
         self._entities.style("", upright)
         corners = np.array([low, (high[0], low[1]), high, (low[0], high[1]), low])
-        bounds = rr.LineStrips2D([corners], colors=style.FAINT, radii=style.THIN, draw_order=0)
-        self._entities.style("bounds", bounds)
+        self._entities.style("bounds", rr.LineStrips2D.from_fields(strips=[corners]))
 
     def _log_density_style(self, scene: FlowScene, cells: int) -> None:
         (x_low, x_high), (y_low, y_high) = scene.support
@@ -130,23 +127,16 @@ class PlaneView:
         self._entities.style("density", place, image)
 
     def _log_styles(self, scene: FlowScene, colour: style.Colour) -> None:
-        lines, points = rr.LineStrips2D.from_fields, rr.Points2D.from_fields
+        for name, archetypes in style.stage_styles(self.stage).items():
+            self._entities.style(name, *archetypes)
+        lines = rr.LineStrips2D.from_fields
         for k, name in enumerate(scene.constraints, start=1):
             if self._is_last and name not in scene.stages:
                 own = lines(colors=rgb(scene.colours[name]), radii=style.LINE, draw_order=18)
                 self._entities.style(f"sets_not_applied/{k}", own)
         for name, archetype in {
             "way_from_stage_before": lines(colors=style.WAY, radii=style.THIN, draw_order=5),
-            "samples": points(colors=style.SAMPLE, radii=style.DOT, draw_order=10),
-            "samples_outside": points(colors=style.BREAKS, radii=style.BAD_DOT, draw_order=11),
             "own_set_dropped": lines(colors=style.dimmed(colour), radii=style.LINE, draw_order=19),
             "own_set": lines(colors=colour, radii=style.WIDE, draw_order=20),
-            "set_so_far": lines(colors=style.PALE, radii=style.THIN, draw_order=21),
-            "executed/path": lines(colors=style.EXECUTED, radii=style.LINE, draw_order=30),
-            "executed/points": points(
-                colors=[style.EXECUTED] * self.stage + [style.BACKGROUND, style.EXECUTED],
-                radii=[style.KNOT] * self.stage + [style.MARK, style.MARK_INSIDE],
-                draw_order=31,
-            ),
         }.items():
             self._entities.style(name, archetype)

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from cnfp_torchrl.envs.layout import BATTERY_FULL
 from cnfp_torchrl.visual.colours import rgb
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
-from cnfp_torchrl.visual.stream import style
+from cnfp_torchrl.visual.stream import components, style
 from cnfp_torchrl.visual.stream.scene import METRICS, SERIES, FlowScene
 
 
@@ -60,7 +60,7 @@ class Series:
             self._log("battery", [charge, layout.battery_threshold])
 
     def _log(self, name: str, values: list[float]) -> None:
-        self._stream.log(f"{SERIES}/{name}", rr.Scalars.from_fields(scalars=values))
+        self._stream.log(f"{SERIES}/{name}", components.scalars(values))
 
     def _log_styles(self) -> None:
         scene = self._scene

@@ -1,8 +1,14 @@
-"""Colours and sizes on a dark background; constraints keep the colours of all figures."""
+"""Colours and sizes on a dark background; constraints keep the colours of all figures.
+
+Of entities that more than one view has, also in which order they are drawn.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Literal
+
+import rerun as rr
 
 from cnfp_torchrl.visual.colours import GOAL, STATION, rgb
 
@@ -46,3 +52,26 @@ def dimmed(colour: Colour) -> Colour:
     """Return a colour half way to the background, for what does not hold."""
     red, green, blue = ((c + b) // 2 for c, b in zip(colour, BACKGROUND, strict=True))
     return red, green, blue
+
+
+def stage_styles(stage: int) -> Mapping[str, Sequence[rr.AsComponents]]:
+    """Return the styles of what the view of a stage shows in the plane and on the line, by entity.
+
+    Args:
+        stage: its index, which says how many points the executed action's path has before it.
+    """
+    lines, points = rr.LineStrips2D.from_fields, rr.Points2D.from_fields
+    return {
+        "bounds": [lines(colors=FAINT, radii=THIN, draw_order=0)],
+        "samples": [points(colors=SAMPLE, radii=DOT, draw_order=10)],
+        "samples_outside": [points(colors=BREAKS, radii=BAD_DOT, draw_order=11)],
+        "set_so_far": [lines(colors=PALE, radii=THIN, draw_order=21)],
+        "executed": [
+            lines(colors=EXECUTED, radii=LINE, draw_order=30),
+            points(
+                colors=[EXECUTED] * stage + [BACKGROUND, EXECUTED],
+                radii=[KNOT] * stage + [MARK, MARK_INSIDE],
+                draw_order=31,
+            ),
+        ],
+    }

@@ -7,7 +7,7 @@ from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.visual.replay import in_float64, replay_step
-from cnfp_torchrl.visual.snapshot import stage_bijector
+from cnfp_torchrl.visual.staged_flow import stage_bijector
 from cnfp_torchrl.visual.stream.density import ActionGrid, as_bytes
 from tests.visual.cases import CONFLICT, LINE, PLANE, make_actor, make_state
 

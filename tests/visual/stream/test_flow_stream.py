@@ -55,7 +55,7 @@ def test_any_flow_in_any_action_space(case: str, flow: str, tmp_path: Path) -> N
         samples = read(path, f"{view}/samples", "Points2D:positions")
         outside = read(path, f"{view}/samples_outside", "Points2D:positions")
         assert sum(len(each.get(0, [])) for each in (samples, outside)) == 64
-    executed = read(path, f"{view}/executed/points", "Points2D:positions")
+    executed = read(path, f"{view}/executed", "Points2D:positions")
     shown = min(dim, 2)
     for step, transition in enumerate((first_step, second_step)):
         at = executed[step][-1, :shown]
@@ -161,7 +161,7 @@ def test_every_so_manieth_step_is_logged_and_all_are_counted(tmp_path: Path) -> 
     path = record(tmp_path / "recording.rrd", write)
     returns = read(path, "/series/return", "Scalars:scalars")
     assert {step: value.item() for step, value in returns.items()} == {0: 1, 3: 4, 6: 7}
-    executed = "/stages/1\\ bounds/executed/points"
+    executed = "/stages/1\\ bounds/executed"
     assert set(read(path, executed, "Points2D:positions")) == {0, 3, 6}
 
 
@@ -170,7 +170,7 @@ def test_projections_are_rows_of_views(tmp_path: Path) -> None:
     (step,) = record_steps(path, SPACE, dim=3, steps=1, projections=[(0, 2), (2, 1)])
     action = step["action"].numpy()
     for pair, components in (("a1\\,\\ a3", [0, 2]), ("a3\\,\\ a2", [2, 1])):
-        executed = read(path, f"/stages/3\\ half/{pair}/executed/points", "Points2D:positions")
+        executed = read(path, f"/stages/3\\ half/{pair}/executed", "Points2D:positions")
         np.testing.assert_array_equal(executed[0][-1], action[components])
 
 
@@ -200,7 +200,7 @@ def test_steps_with_gradients_are_logged(tmp_path: Path) -> None:
     assert transition["action"].requires_grad
     path = tmp_path / "r.rrd"
     record(path, lambda stream: FlowStream(stream, actor).log_step(0, transition))
-    executed = read(path, "/stages/4\\ speed/executed/points", "Points2D:positions")[0]
+    executed = read(path, "/stages/4\\ speed/executed", "Points2D:positions")[0]
     np.testing.assert_array_equal(executed[-1], transition["action"].detach().numpy())
 
 

@@ -35,7 +35,7 @@ def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorD
     return env, actor
 
 
-EXECUTED = "/stages/3\\ obstacle/executed/points"
+EXECUTED = "/stages/3\\ obstacle/executed"
 
 
 @pytest.mark.parametrize(("batch", "agent"), [([3], 1), ([], 0)])
