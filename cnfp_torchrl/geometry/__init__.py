@@ -10,6 +10,7 @@ from cnfp_torchrl.geometry.positive_part import PositivePart
 from cnfp_torchrl.geometry.projection import project, project_onto_intersection
 from cnfp_torchrl.geometry.region import Region
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
+from cnfp_torchrl.geometry.task_space_ball import TaskSpaceBall
 from cnfp_torchrl.geometry.visible_or_box import VisibleOrBox
 from cnfp_torchrl.geometry.visible_region import VisibleRegion
 from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
@@ -28,6 +29,7 @@ __all__ = [
     "Region",
     "Rows",
     "Superlevel",
+    "TaskSpaceBall",
     "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",

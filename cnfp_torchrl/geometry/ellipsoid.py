@@ -14,6 +14,7 @@ from torch.linalg import solve_triangular, vector_norm
 from cnfp_torchrl.geometry.ball import ball_gauge_about
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.matrix_norm import spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone
 
 
@@ -94,11 +95,8 @@ class Ellipsoid(ConstraintSet):
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
 
     def _inverse_norm(self) -> Tensor:
-        """Return a bound of the spectral norm of ``T^-1``, exact where T is diagonal."""
-        inverse = solve_triangular(self.scale_tril, self._identity(), upper=False)
-        sums = inverse.abs()
-        bound = (sums.sum(-1).amax(-1) * sums.sum(-2).amax(-1)).sqrt()
-        return torch.minimum(bound, vector_norm(inverse, dim=(-2, -1)))
+        """Return a bound of the spectral norm of ``T^-1``."""
+        return spectral_norm_bound(solve_triangular(self.scale_tril, self._identity(), upper=False))
 
 
 def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:

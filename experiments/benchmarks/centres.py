@@ -34,13 +34,14 @@ from cnfp_torchrl.geometry import (
     Ellipsoid,
     HalfSpaces,
     PositivePart,
+    TaskSpaceBall,
     WeightedL1Ball,
     chebyshev_centre,
     lexicographic_centre,
 )
 
 Array = NDArray[np.float64]
-FAMILIES = (Box, Ball, Ellipsoid, HalfSpaces, WeightedL1Ball, PositivePart)
+FAMILIES = (Box, Ball, Ellipsoid, HalfSpaces, WeightedL1Ball, PositivePart, TaskSpaceBall)
 # Shares of the dimensions; SciPy spends most of its time on the few large ones.
 DIMS = {1: 0.1, 2: 0.15, 3: 0.15, 4: 0.14, 6: 0.14, 8: 0.12, 12: 0.08, 16: 0.06, 24: 0.03, 32: 0.03}
 RESULT = Path(__file__).with_suffix(".json")
@@ -104,11 +105,14 @@ def _shrunk(each: ConstraintSet, by: Tensor) -> ConstraintSet:
         case Ball(center, radius):
             return Ball(center, (radius - by).clamp(min=1e-9))
         case Ellipsoid(center, scale_tril):
-            norms = [_inverse_norm(matrix) for matrix in scale_tril.inverse().numpy()]
+            norms = [_norm_bound(matrix) for matrix in scale_tril.inverse().numpy()]
             share = (1 - by * torch.tensor(norms, dtype=torch.float64)).clamp(min=1e-6)
             return Ellipsoid(center, scale_tril * share[:, None, None])
         case HalfSpaces(normals, offsets):
             return HalfSpaces(normals, offsets - by.unsqueeze(-1) * normals.norm(dim=-1))
+        case TaskSpaceBall(jacobian, offset, radius):
+            norm = torch.tensor([_norm_bound(matrix) for matrix in jacobian.numpy()]).double()
+            return TaskSpaceBall(jacobian, offset, (radius - by * norm).clamp(min=1e-9))
         case WeightedL1Ball(weights, bound) | PositivePart(weights, bound):
             return type(each)(weights, (bound - by * weights.norm(dim=-1)).clamp(min=1e-9))
     raise TypeError(type(each))
@@ -142,6 +146,14 @@ def _random_set(rng: np.random.Generator, anchor: Array, slack: Array) -> Constr
         lengths = np.linalg.norm(normals, axis=-1)
         offsets = (normals @ anchor[..., None])[..., 0] + slack[:, None] * lengths
         return HalfSpaces(tensor(normals), tensor(offsets))
+    if family is TaskSpaceBall:
+        jacobian = rng.normal(size=(count, int(rng.integers(1, dim + 1)), dim)) * scale[..., None]
+        norms = np.array([_norm_bound(matrix) for matrix in jacobian])
+        distance = norms * (np.maximum(-slack, 0) + 1e-3 + rng.uniform(0, 1, count))
+        image = rng.normal(size=jacobian.shape[:2])
+        image *= (distance / np.linalg.norm(image, axis=-1))[:, None]
+        offset = image - (jacobian @ anchor[..., None])[..., 0]
+        return TaskSpaceBall(tensor(jacobian), tensor(offset), tensor(distance + slack * norms))
     weights = away * scale * (rng.uniform(size=(count, dim)) > 0.2)
     weights[:, 0] += scale[:, 0]
     terms = weights * anchor
@@ -160,7 +172,7 @@ def scipy_best_slack(sets: list[ConstraintSet], index: int) -> float:
     parts = [{n: v[index].numpy() for n, v in each.fields().items()} for each in sets]
     rows, offsets = _linear_rows(sets, parts)
     kinked = [(each, p) for each, p in zip(sets, parts, strict=True) if "weights" in p]
-    cones = [_cone_functions(part, dim) for part in parts if "center" in part]
+    cones = [_cone_functions(p, dim) for p in parts if "center" in p or "jacobian" in p]
     x = np.zeros(dim + 1)
     best = -np.inf
     for _ in range(100):
@@ -221,29 +233,31 @@ Cone = tuple[Callable[[Array], Array], Callable[[Array], Array]]
 
 
 def _cone_functions(part: dict[str, Array], dim: int) -> Cone:
+    """Return by how much ``(height - |W a + y|) / rate`` exceeds the slack, and its gradient."""
     white: Array = np.eye(dim)
-    rate, height = 1.0, 1.0
-    if "radius" in part:
-        height = float(part["radius"])
-    else:
+    rate, height = 1.0, float(part.get("radius", 1.0))
+    if "jacobian" in part:
+        white, rate = part["jacobian"], _norm_bound(part["jacobian"])
+    if "scale_tril" in part:
         white = np.asarray(np.linalg.inv(part["scale_tril"]), dtype=np.float64)
-        rate = _inverse_norm(white)
+        rate = _norm_bound(white)
+    vector = part["offset"] if "offset" in part else -white @ part["center"]
 
     def fun(x: Array) -> Array:
-        length = np.linalg.norm(white @ (x[:dim] - part["center"]))
+        length = np.linalg.norm(white @ x[:dim] + vector)
         return np.array([(height - length) / rate - x[dim]])
 
     def jac(x: Array) -> Array:
-        y = white @ (x[:dim] - part["center"])
+        y = white @ x[:dim] + vector
         length = max(float(np.linalg.norm(y)), 1e-12)
         return np.append(-(white.T @ y) / length / rate, -1.0)[None]
 
     return fun, jac
 
 
-def _inverse_norm(inverse: Array) -> float:
-    bound = np.sqrt(np.abs(inverse).sum(0).max() * np.abs(inverse).sum(1).max())
-    return float(min(bound, np.linalg.norm(inverse)))
+def _norm_bound(matrix: Array) -> float:
+    bound = np.sqrt(np.abs(matrix).sum(0).max() * np.abs(matrix).sum(1).max())
+    return float(min(bound, np.linalg.norm(matrix)))
 
 
 def numpy_slack(sets: list[ConstraintSet], index: int, action: Array) -> float:
@@ -258,7 +272,10 @@ def numpy_slack(sets: list[ConstraintSet], index: int, action: Array) -> float:
         elif isinstance(each, Ellipsoid):
             inverse = np.linalg.inv(f["scale_tril"])
             length = np.linalg.norm(inverse @ (action - f["center"]))
-            slacks.append(float((1 - length) / _inverse_norm(inverse)))
+            slacks.append(float((1 - length) / _norm_bound(inverse)))
+        elif isinstance(each, TaskSpaceBall):
+            length = np.linalg.norm(f["jacobian"] @ action + f["offset"])
+            slacks.append(float((f["radius"] - length) / _norm_bound(f["jacobian"])))
         elif isinstance(each, HalfSpaces):
             room = f["offsets"] - f["normals"] @ action
             slacks.append((room / np.linalg.norm(f["normals"], axis=-1)).min())

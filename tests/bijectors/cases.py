@@ -29,6 +29,7 @@ from cnfp_torchrl.geometry import (
     HalfSpaces,
     PositivePart,
     Region,
+    TaskSpaceBall,
     VisibleRegion,
     WeightedL1Ball,
 )
@@ -279,6 +280,17 @@ class Maker:
         used = (weights * self.centre).clamp(min=0).sum(-1)
         return PositivePart(weights, rounded(used + self._room(weights)))
 
+    def task_space_ball(self) -> TaskSpaceBall:
+        """As many rows as half of the components, so that there is a null space if d > 1."""
+        jacobian = rounded(self.normal((self.dim + 1) // 2, self.dim))
+        norm = jacobian.norm(dim=(-2, -1))
+        gap = (self.gap().squeeze(-1) + 8 * self.rounding * math.sqrt(self.dim)) * norm
+        radius = gap + norm * self.size * self.uniform(1).squeeze(-1)
+        towards = self.normal(jacobian.shape[-2])
+        towards = towards / towards.norm(dim=-1, keepdim=True) * (radius - gap).unsqueeze(-1)
+        image = (jacobian * self.centre.unsqueeze(-2)).sum(-1)
+        return TaskSpaceBall(jacobian, rounded(towards - image), rounded(radius))
+
     def _room(self, weights: Tensor) -> Tensor:
         gap = self.slack * 30 ** self.uniform(1).squeeze(-1)
         return (gap + 4 * self.rounding * math.sqrt(self.dim)) * weights.norm(dim=-1)
@@ -380,6 +392,8 @@ def regions() -> Regions:
     add(
         "small-d6", Maker(6, size=1e-3, slack=0.05, seed=32), Maker.box, Maker.ball, Maker.ellipsoid
     )
+    add("task-space-d2-batch", Maker(2, (3,), seed=44), Maker.task_space_ball)
+    add("task-space-box-d6", Maker(6, seed=45), Maker.box, Maker.task_space_ball)
     add("l1-d6-batch", Maker(6, (3,), slack=0.05, seed=33), Maker.weighted_l1)
     add(
         "large-d32",

@@ -20,6 +20,7 @@ from cnfp_torchrl.geometry import (
     Ellipsoid,
     HalfSpaces,
     PositivePart,
+    TaskSpaceBall,
     VisibleRegion,
     WeightedL1Ball,
 )
@@ -59,6 +60,9 @@ def contains(
             return np.abs(fields["weights"] * a).sum(-1) <= fields["bound"]
         case PositivePart():
             return np.maximum(fields["weights"] * a, 0).sum(-1) <= fields["bound"]
+        case TaskSpaceBall():
+            image = (fields["jacobian"] * a[..., None, :]).sum(-1) + fields["offset"]
+            return (image**2).sum(-1) <= fields["radius"] ** 2
         case VisibleRegion():
             return _sees(fields, a)
     raise NotImplementedError(type(each).__name__)
@@ -120,6 +124,9 @@ def level(each: ConstraintSet, action: Vector) -> mpf:
         case PositivePart():
             terms = zip(fields["weights"], action, strict=True)
             return sum((max(w * a, mpf(0)) for w, a in terms), mpf(0)) / fields["bound"]
+        case TaskSpaceBall():
+            rows = zip(fields["jacobian"], fields["offset"], strict=True)
+            return mp.sqrt(sum((dot(row, action) + b) ** 2 for row, b in rows)) / fields["radius"]
     raise NotImplementedError(type(each).__name__)
 
 

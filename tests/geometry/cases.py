@@ -16,6 +16,7 @@ from cnfp_torchrl.geometry import (
     Ellipsoid,
     HalfSpaces,
     PositivePart,
+    TaskSpaceBall,
     VisibleOrBox,
     VisibleRegion,
     WeightedL1Ball,
@@ -101,6 +102,20 @@ def _positive_part(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tenso
     return PositivePart(weights, 0.2 + torch.rand(batch)), torch.zeros(*batch, d)
 
 
+def _task_space_ball(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
+    """About as many rows as half of the components, so that there is a null space if d > 1."""
+    jacobian = torch.randn(*batch, (d + 1) // 2, d) / d**0.5
+    inside = torch.randn(*batch, d)
+    offset = -(jacobian * inside.unsqueeze(-2)).sum(-1)
+    return TaskSpaceBall(jacobian, offset, 0.3 + torch.rand(batch)), inside
+
+
+def _ball_of_some_components(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
+    return TaskSpaceBall(
+        torch.eye(d)[: d // 2], 0.1 * torch.ones(d // 2), 0.4 * torch.ones(batch)
+    ), (torch.zeros(*batch, d))
+
+
 def _visible(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
     """One rectangle about a unit away from the position, and walls."""
     position = 0.3 * torch.randn(*batch, d).clamp(-2, 2)
@@ -132,6 +147,8 @@ FAMILIES: dict[str, tuple[Make, tuple[int, ...]]] = {
     "l1-ball": (_l1_ball, (1, 2, 6, 32)),
     "l1-ball-with-zeros": (_l1_ball_with_zeros, (2, 32)),
     "positive-part": (_positive_part, (1, 2, 6, 32)),
+    "task-space-ball": (_task_space_ball, (1, 2, 6, 32)),
+    "ball-of-components": (_ball_of_some_components, (2, 6)),
     "visible": (_visible, (1, 2, 3)),
     "sight-or-box": (_visible_or_box, (2,)),
     "zero-rows": (_half_spaces_with_zero_rows, (2, 6)),
@@ -214,6 +231,8 @@ def _scaled(sets: ConstraintSet, size: float) -> ConstraintSet:
             return HalfSpaces(normals, offsets * size)
         case WeightedL1Ball(weights, bound) | PositivePart(weights, bound):
             return type(sets)(weights / size, bound)
+        case TaskSpaceBall(jacobian, offset, radius):
+            return TaskSpaceBall(jacobian / size, offset, radius)
         case VisibleRegion(position, rectangles, step):
             return VisibleRegion(position, rectangles, step / size)
         case VisibleOrBox(position, rectangles, step, low, high, in_sight):

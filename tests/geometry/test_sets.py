@@ -61,7 +61,9 @@ def test_slack_tells_inside_from_outside_and_bounds_the_distance(case: Case) -> 
         # Nothing nearer than the slack is on the other side, also not straight ahead.
         action = action.requires_grad_()
         steepest = torch.autograd.grad(case.sets.slack(action).nan_to_num().sum(), action)[0]
-        reach = (slack.abs().clamp(max=1e3 * case.size) * (1 - 1e-9)).unsqueeze(-1)
+        # But for rounding error of all that is of the size of the set, or of the actions.
+        rounding = 1e-12 * (case.size + action.detach().abs().amax(-1))
+        reach = (slack.abs().clamp(max=1e3 * case.size) - rounding).clamp(min=0).unsqueeze(-1)
         for way in (*case.directions(6, torch.float64), steepest, -steepest):
             length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
             near = action.detach() + way / torch.where(length > 0, length, 1.0) * reach

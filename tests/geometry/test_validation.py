@@ -18,6 +18,7 @@ from cnfp_torchrl.geometry import (
     HalfSpaces,
     PositivePart,
     Region,
+    TaskSpaceBall,
     VisibleRegion,
     WeightedL1Ball,
 )
@@ -65,6 +66,18 @@ BAD: list[tuple[Callable[[], ConstraintSet], tuple[str, ...]]] = [
     (
         lambda: HalfSpaces(t([1.0, 0.0]), t(1.0, 2.0)),
         ("HalfSpaces", "as many offsets as normals", "2 and 1"),
+    ),
+    (
+        lambda: TaskSpaceBall(t([1.0, 0.0]), t(0.0), t(0.0)[0]),
+        ("TaskSpaceBall", "'radius'", "> 0", "0.0"),
+    ),
+    (
+        lambda: TaskSpaceBall(t([1.0, -INF]), t(0.0), t(1.0)[0]),
+        ("TaskSpaceBall", "'jacobian'", "[0, 1]", "finite", "-inf"),
+    ),
+    (
+        lambda: TaskSpaceBall(t([1.0, 0.0]), t(0.0, 1.0), t(1.0)[0]),
+        ("TaskSpaceBall", "as many components of the offset as rows of the jacobian", "2 and 1"),
     ),
     (
         lambda: WeightedL1Ball(t(1.0, INF), t(1.0)[0]),
