@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from typing import Any
 
@@ -19,11 +20,18 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.environment import counted_constraints
-from cnfp_torchrl.training.evaluation import Evaluation, evaluate
+from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings
-from cnfp_torchrl.training.watching import RECORDING, TrainingWatcher, Unwatched, Watch
+from cnfp_torchrl.training.watching import (
+    RECORDING,
+    EpisodeCollector,
+    TrainingWatcher,
+    Unwatched,
+    Watch,
+    first_episodes,
+)
 
 
 def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
@@ -98,32 +106,40 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
                     owed -= 1
             metrics.log_if_due()
         metrics.finish()
-    collector.shutdown()
-    folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
+        collector.shutdown()
+        # Before anything else that may fail or be interrupted.
+        folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
 
-    # Evaluation
-    results = {
-        name: _evaluate(config, actor, judgement, deterministic=name == "deterministic")
-        for name in ("stochastic", "deterministic")
-    }
-    violations = {
-        name: count + sum(result.violations[name] for result in results.values())
-        for name, count in metrics.violations.items()
-    }
-    stochastic = results["stochastic"].report(score)
-    summary = {
-        "return_mean": stochastic["return_mean"],
-        "score": stochastic["score"],
-        "violations": violations,
-        "steps": metrics.frames,
-        "seconds": time.perf_counter() - started,
-        "training_violations": metrics.violations,
-        "evaluation": {name: result.report(score) for name, result in results.items()},
-        "flow": type(flow_head(actor).flow).__name__,
-        "order": list(config.flow.order),
-        "seed": config.seed,
-    }
-    folder.save_summary(summary)
+        # Evaluation
+        watched: dict[bool, EpisodeCollector] = {}
+        if watch is not None:
+            watched[watch.deterministic] = EpisodeCollector(first_episodes(watch, judgement))
+        results = {
+            name: _evaluate(config, actor, judgement, deterministic=each, see=watched.get(each))
+            for name, each in {"stochastic": False, "deterministic": True}.items()
+        }
+        violations = {
+            name: count + sum(result.violations[name] for result in results.values())
+            for name, count in metrics.violations.items()
+        }
+        stochastic = results["stochastic"].report(score)
+        summary = {
+            "return_mean": stochastic["return_mean"],
+            "score": stochastic["score"],
+            "violations": violations,
+            "steps": metrics.frames,
+            "seconds": time.perf_counter() - started,
+            "training_violations": metrics.violations,
+            "evaluation": {name: result.report(score) for name, result in results.items()},
+            "flow": type(flow_head(actor).flow).__name__,
+            "order": list(config.flow.order),
+            "seed": config.seed,
+        }
+        folder.save_summary(summary)
+        # When the results are kept: a stream that fails takes nothing with it.
+        for shown in watched.values():
+            for episode in shown.episodes.values():
+                watcher.see_episode(episode)
     return summary
 
 
@@ -133,10 +149,10 @@ def _evaluate(
     settings: EvaluationSettings,
     *,
     deterministic: bool,
+    see: Callable[[TensorDictBase], None] | None,
 ) -> Evaluation:
     env = build_environment(config, batch_size=[settings.episodes])
-    env.set_seed(settings.seed)
-    return evaluate(env, guarded(actor), episodes=settings.episodes, deterministic=deterministic)
+    return evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic, see=see)
 
 
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")

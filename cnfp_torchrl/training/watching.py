@@ -23,7 +23,7 @@ RECORDING = "recording.rrd"
 
 
 class TrainingWatcher(Protocol):
-    """Sees every batch that a collector yields."""
+    """Sees every batch that a collector yields, and then episodes of the final evaluation."""
 
     @property
     def loggers(self) -> Sequence[Logger]:
@@ -32,6 +32,10 @@ class TrainingWatcher(Protocol):
 
     def see(self, batch: TensorDictBase) -> None:
         """Look at a batch of transitions ``(*environments, time)``, without changing it."""
+        ...
+
+    def see_episode(self, episode: Sequence[TensorDictBase]) -> None:
+        """Look at the transitions of an episode, each of batch size ``()``; after all batches."""
         ...
 
     def close(self) -> None:
@@ -83,6 +87,9 @@ class Unwatched:
     def see(self, batch: TensorDictBase) -> None:
         """Do nothing."""
 
+    def see_episode(self, episode: Sequence[TensorDictBase]) -> None:
+        """Do nothing."""
+
     def close(self) -> None:
         """Do nothing."""
 
@@ -109,13 +116,18 @@ def watch_run(
     actor = load_actor(folder, config, env)
     watcher = watch.of_episodes(recording, actor, env)
     try:
-        wanted = range(min(watch.episodes, settings.episodes))
+        wanted = first_episodes(watch, settings)
         for episode in replay_episodes(env, actor, settings, wanted, watch.deterministic):
             watcher.see(episode)
     except BaseException:
         watcher.close()
         raise
     return watcher
+
+
+def first_episodes(watch: Watch, settings: EvaluationSettings) -> range:
+    """Return the numbers of the episodes of an evaluation that are watched."""
+    return range(min(watch.episodes, settings.episodes))
 
 
 def replay_episodes(

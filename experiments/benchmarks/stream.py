@@ -1,7 +1,8 @@
 """Time the stream to Rerun: `python experiments/benchmarks/stream.py [--quick] [--output FOLDER]`.
 
 Measures processor time, of all threads, with everything written to a file: each step of an
-evaluation in full detail, and a training step of which each tenth is logged. Without a stream
+evaluation in full detail, and training as the collector's hook sees it, one agent of 16 and each
+tenth of its steps. Without a stream
 nothing of it is called, so that there is nothing to measure; that Rerun is not even imported then
 is measured instead.
 """
@@ -17,7 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -32,11 +34,13 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.training.environment import make_environment
-from cnfp_torchrl.visual.stream import FlowStream, flow_blueprint
+from cnfp_torchrl.visual.stream import FlowStream, StreamHook, flow_blueprint
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
+AGENTS = 16
 EVERY = 10
-GOALS_MS = {"evaluation, each step": 10.0, f"training, every {EVERY}th step": 1.5}
+EVALUATION, TRAINING = "evaluation, each step", f"training, every {EVERY}th step"
+GOALS_MS = {EVALUATION: 10.0, TRAINING: 1.5}
 
 _WHAT_IS_IMPORTED = (
     "import sys, cnfp_torchrl.visual, cnfp_torchrl.training.train; print('rerun' in sys.modules)"
@@ -55,7 +59,7 @@ class StandardNormal(nn.Module):
 def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
     """Return point navigation with K = 2 constraints, and an actor for it."""
     env = make_environment(
-        PointNavEnv([1], seed=0),
+        PointNavEnv([AGENTS], seed=0),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=["battery", "obstacle"],
         with_centre=True,
@@ -66,32 +70,50 @@ def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
     return env, actor
 
 
+class EachStep:
+    """Stream transitions of batch size ``()``, one after another, as evaluations do.
+
+    Args:
+        stream: of the policy.
+    """
+
+    def __init__(self, stream: FlowStream) -> None:
+        self._stream, self._step = stream, 0
+
+    def __call__(self, transition: TensorDictBase) -> None:
+        """Stream the next transition."""
+        self._stream.log_step(self._step, transition)
+        self._step += 1
+
+
 def processor_time(
     env: TransformedEnv,
     actor: SafeProbabilisticTensorDictSequential,
     steps: Sequence[TensorDictBase],
     every: int,
+    way: Callable[[FlowStream], Callable[[TensorDictBase], None]],
 ) -> tuple[float, float]:
     """Return milliseconds of processor time and bytes of the file, for each step.
 
     Args:
         env: of point navigation.
         actor: its policy.
-        steps: transitions of batch size ``()``; the first tenth warms up.
+        steps: what the way into the stream takes for a step; the first tenth warms up.
         every: see `FlowStream`.
+        way: into the stream.
     """
     warm_up = len(steps) // 10
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.rrd"
         recording = rr.RecordingStream("benchmark")
         recording.set_sinks(rr.FileSink(path), default_blueprint=flow_blueprint(actor, env))
-        stream = FlowStream(recording, actor, env, every=every)
-        for step in range(warm_up):
-            stream.log_step(step, steps[step])
+        see = way(FlowStream(recording, actor, env, every=every))
+        for step in steps[:warm_up]:
+            see(step)
         recording.flush(timeout_sec=30)
         size, start = path.stat().st_size, time.process_time()
-        for step in range(warm_up, len(steps)):
-            stream.log_step(step, steps[step])
+        for step in steps[warm_up:]:
+            see(step)
         recording.flush(timeout_sec=30)
         taken = time.process_time() - start
         size = path.stat().st_size - size
@@ -118,7 +140,8 @@ def table(rows: dict[str, dict[str, Any]], setting: dict[str, Any]) -> str:
         "",
         "Processor time of all threads for a step of point navigation (K = 2, 512 samples, three "
         "stages, densities on 40 x 40 cells), written to a file; median and range of "
-        f"{setting['repeats']} repeats of {setting['steps']} steps. One thread of PyTorch "
+        f"{setting['repeats']} repeats of {setting['steps']} steps. In training, the collector's "
+        f"hook streams one of {AGENTS} agents. One thread of PyTorch "
         f"{setting['torch']}, Rerun {setting['rerun']}, Python {setting['python']} on "
         f"{setting['processor']}.",
         "",
@@ -152,16 +175,28 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     env, actor = pipeline()
-    rollout = env.rollout(steps, actor, break_when_any_done=False)[0].unbind(0)
+    rollout = env.rollout(steps, actor, break_when_any_done=False)
+    measured: dict[str, Callable[[], tuple[float, float]]] = {
+        EVALUATION: partial(processor_time, env, actor, rollout[0].unbind(0), 1, EachStep),
+        # A collector yields batches (environments, time) of one step, each with its own memory.
+        TRAINING: partial(
+            processor_time,
+            env,
+            actor,
+            [batch.clone() for batch in rollout.split(1, dim=1)],
+            EVERY,
+            StreamHook,
+        ),
+    }
     off = subprocess.run(
         [sys.executable, "-c", _WHAT_IS_IMPORTED], check=True, capture_output=True, text=True
     )
     rows: dict[str, dict[str, Any]] = {name: {"ms": [], "bytes": 0.0} for name in GOALS_MS}
     references = []
     for _ in range(repeats):
-        for name, every in zip(rows, (1, EVERY), strict=True):
+        for name, measure in measured.items():
             references.append(reference())
-            milliseconds, size = processor_time(env, actor, rollout, every)
+            milliseconds, size = measure()
             rows[name]["ms"].append(milliseconds)
             rows[name]["bytes"] = size
     setting = {

@@ -1,5 +1,6 @@
 """``visual=...`` of the commands: what is recorded, and what it changes in the run: nothing."""
 
+import json
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 import rerun_cli
@@ -18,17 +20,18 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rerun.chunk import RrdReader
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.modules import guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.evaluation import evaluate_seeded
-from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
+from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
 from cnfp_torchrl.training.watching import EpisodeCollector, replay_episodes, watch_run
-from cnfp_torchrl.visual.stream import RunningViewer
+from cnfp_torchrl.visual.stream import Recording, RunningViewer
+from tests.visual.stream.recorded import read
 
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 FILE = ["visual=file", "visual.samples=16"]
@@ -78,13 +81,111 @@ def test_off_imports_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.rrd"))
 
 
-def test_the_recording_has_each_tenth_step_and_the_log(tiny_run: Run) -> None:
+def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run: Run) -> None:
     folder, _ = tiny_run(*FILE, "collector.total_frames=400", "training.log_interval=160")
     path = folder.path / "recording.rrd"
-    # 16 agents are stepped together: 25 steps of each.
-    assert steps_of(path, "/explanation") == [0, 160, 320]
+    # 16 agents are stepped together: 25 steps of each. Then an evaluation episode of 12 steps.
+    assert steps_of(path, "/explanation") == [0, 160, 320, *range(400, 412)]
     for name in ("violations/obstacle", "loss/qvalue", "loss/actor", "train/alpha"):
         assert steps_of(path, f"/metrics/{name}") == [160, 320, 400], name
+
+
+@pytest.fixture
+def evaluated(monkeypatch: pytest.MonkeyPatch) -> dict[bool, list[list[TensorDictBase]]]:
+    """The first two episodes of a training's evaluations, by whether they are deterministic."""
+    episodes = {}
+
+    def spied(*given: Any, deterministic: bool, see: Callable | None, **options: Any) -> Evaluation:
+        kept = EpisodeCollector(range(2))
+
+        def look(transition: TensorDictBase) -> None:
+            kept(transition)
+            if see is not None:
+                see(transition)
+
+        result = evaluate_seeded(*given, deterministic=deterministic, see=look, **options)
+        episodes[deterministic] = list(kept.episodes.values())
+        return result
+
+    monkeypatch.setattr("cnfp_torchrl.training.train.evaluate_seeded", spied)
+    return episodes
+
+
+@pytest.mark.parametrize("flow", ["exact", "squash", "none"])
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_final_evaluation_follows_the_training(
+    deterministic: bool,
+    flow: str,
+    tiny_run: Run,
+    evaluated: dict[bool, list[list[TensorDictBase]]],
+) -> None:
+    chosen = ["visual.episodes=2", f"visual.deterministic={deterministic}", f"flow={flow}"]
+    folder, _ = tiny_run(*FILE, *chosen)
+    path = folder.path / "recording.rrd"
+    steps = [step for episode in evaluated[deterministic] for step in episode]
+    behind = range(192, 192 + 24)
+    assert len(steps) == len(behind)
+    last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "none": "1\\ bounds"}[flow]
+    executed = read(path, f"/stages/{last}/executed", "Points2D:positions")
+    assert [step for step in executed if step >= 0] == [0, 160, *behind]
+    for number, step in zip(behind, steps, strict=True):
+        np.testing.assert_array_equal(executed[number][-1], step["action"].numpy())
+    # An episode's return begins anew, and so does the first one's, whatever the training left.
+    reward = torch.stack([step["next", "reward"].squeeze() for step in steps]).double()
+    returns = read(path, "/series/return", "Scalars:scalars")
+    expected = reward.reshape(2, 12).cumsum(1).reshape(-1)
+    np.testing.assert_allclose([returns[number].item() for number in behind], expected.numpy())
+    trail = read(path, "/map/trail", "LineStrips2D:strips")
+    assert [len(trail[number][-1]) for number in (192, 193, 204)] == [1, 2, 1]
+    words = {
+        number: text.item()
+        for number, text in read(path, "/explanation", "TextDocument:text").items()
+    }
+    policy = "deterministic" if deterministic else "stochastic"
+    for number, episode, step in ((192, 0, 0), (199, 0, 7), (215, 1, 11)):
+        head = f"Evaluation, episode {episode}, step {step} of 12, {policy} policy: **"
+        assert words[number].startswith(head)
+    assert words[160].startswith("**")
+
+
+def test_a_stream_that_fails_costs_no_results(
+    tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, expected = tiny_run()
+
+    def fail(*_: Any) -> None:
+        raise OSError("no stream")
+
+    monkeypatch.setattr("cnfp_torchrl.visual.stream.watch.WatchedTraining.see_episode", fail)
+    with pytest.raises(OSError, match="no stream"):
+        tiny_run(*FILE)
+    folder = RunFolder.open(tmp_path / "run1")
+    assert json.loads((folder.path / SUMMARY).read_text())["evaluation"] == expected["evaluation"]
+    assert steps_of(folder.path / "recording.rrd", "/explanation") == [0, 160]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_evaluation_that_fails_costs_neither_checkpoint_nor_recording(
+    error: type[BaseException], tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error("no evaluation")
+
+    closed = []
+    close = Recording.close
+
+    def spied(self: Recording) -> None:
+        closed.append(self.path)
+        close(self)
+
+    monkeypatch.setattr("cnfp_torchrl.training.train.evaluate_seeded", fail)
+    monkeypatch.setattr(Recording, "close", spied)
+    with pytest.raises(error, match="no evaluation"):
+        tiny_run(*FILE)
+    folder = RunFolder.open(tmp_path / "run0")
+    assert folder.load_checkpoint()["actor"]
+    assert closed == [folder.path / "recording.rrd"]
+    assert steps_of(closed[0], "/explanation") == [0, 160]
 
 
 def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run) -> None:
@@ -93,6 +194,7 @@ def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run
         tiny_run(*FILE, "training.warmup_frames=48", "visual.every=1", f"seed={seed}")
         for seed in (0, 0, 1)
     )
+    assert steps_of(one[0].path / "recording.rrd", "/explanation")[-12:] == list(range(192, 204))
     for key in ("return_mean", "violations", "evaluation"):
         assert one[1][key] == unwatched[1][key]
     states = [folder.load_checkpoint()["loss"] for folder in (one[0], unwatched[0])]
@@ -191,8 +293,11 @@ def test_replayed_episodes_are_those_of_the_evaluation(
         assert total == pytest.approx(float(expected[number]), rel=1e-5)
 
     watch = instantiate({"_target_": "cnfp_torchrl.visual.stream.Watch", "episodes": 2})
-    watch_run(folder, settings, watch, tmp_path / "recording.rrd").close()
-    assert steps_of(tmp_path / "recording.rrd", "/explanation") == list(range(24))
+    path = tmp_path / "recording.rrd"
+    watch_run(folder, settings, watch, path).close()
+    assert steps_of(path, "/explanation") == list(range(24))
+    words = read(path, "/explanation", "TextDocument:text")[19].item()
+    assert words.startswith("Evaluation, episode 1, step 7 of 12, stochastic policy: **")
 
 
 def test_episodes_of_an_environment_without_batch_follow_each_other() -> None:

@@ -72,8 +72,8 @@ class Entities:
         self._stream.log(f"{self._root}/{name}", values)
 
     def _is_new(self, name: str, ends: NDArray[np.int32], flat: NDArray[np.float32]) -> bool:
-        # An entity that was never logged shows nothing, as an empty one does.
-        last = self._last.get(name, (_END.tobytes(), b""))
+        # What is empty at first is logged, too: another stream may have left something there.
+        last = self._last.get(name)
         now = self._last[name] = ends.tobytes(), flat.tobytes()
         return now != last
 

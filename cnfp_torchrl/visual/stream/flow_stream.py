@@ -9,7 +9,7 @@ from typing import Protocol
 
 import rerun as rr
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
@@ -88,7 +88,7 @@ class FlowStream:
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         head = flow_head(actor)
-        self._checked = [
+        self._checked: list[NestedKey] = [
             head.action_key,
             *head.parameter_keys,
             ("next", "reward"),
@@ -107,14 +107,26 @@ class FlowStream:
         if scene.dim <= 2:
             self._grid = ActionGrid(scene.support, cells if scene.dim == 2 else 4 * cells)
 
+    @property
+    def is_due(self) -> bool:
+        """Whether the next step will be logged, and not only counted."""
+        return self._calls % self._every == 0
+
+    @property
+    def counted_keys(self) -> list[NestedKey]:
+        """What is read of a step that is only counted, where it is there."""
+        place: list[NestedKey] = [] if self._map is None else ["observation"]
+        return [*self._checked, ("next", "done"), *place]
+
     @torch.no_grad()
-    def log_step(self, step: int, transition: TensorDictBase) -> None:
+    def log_step(self, step: int, transition: TensorDictBase, heading: str = "") -> None:
         """Log one step, or only count it where it is not each so manieth one.
 
         Args:
             step: of the environment, on the timeline ``env_step``.
             transition: of batch size ``()``: the state with its geometry, the executed action, the
                 policy's location and scale, and reward, cost and done under ``next``.
+            heading: begins the explanation, such as with the episode that the step belongs to.
 
         Raises:
             ValueError: when the transition is a batch, or a number in it is not finite, which
@@ -137,9 +149,9 @@ class FlowStream:
         self._series.follow(transition)
         if self._map is not None:
             self._map.follow(transition)
-        if self._calls % self._every == 0:
+        if self.is_due:
             self._stream.set_time(TIMELINE, sequence=step)
-            self._log_details(replay_step(self._actor, transition, self._noise))
+            self._log_details(replay_step(self._actor, transition, self._noise), heading)
         self._calls += 1
         done = transition.get(("next", "done"), None)
         if done is not None and bool(done.any()):
@@ -147,7 +159,7 @@ class FlowStream:
             if self._map is not None:
                 self._map.end_episode()
 
-    def _log_details(self, snapshot: FlowSnapshot) -> None:
+    def _log_details(self, snapshot: FlowSnapshot, heading: str) -> None:
         region = in_float64(snapshot.region)
         outlines: dict[tuple[int, ...], RayOutlines] = {}
 
@@ -176,7 +188,9 @@ class FlowStream:
             facts=None if facts is None else facts.by_constraint,
             situation=None if facts is None else facts.situation,
         ).markdown()
-        self._stream.log(EXPLANATION, components.text(words))
+        # In the first sentence's line: the panel shows few.
+        said = f"{heading}: {words}" if heading else words
+        self._stream.log(EXPLANATION, components.text(said))
         self._series.log(snapshot)
 
     def _refuse_what_is_not_finite(self, step: int, transition: TensorDictBase) -> None:

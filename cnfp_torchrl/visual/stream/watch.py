@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -64,7 +64,12 @@ class Watch:
         Raises:
             SinkError: when file or viewer cannot be had.
         """
-        return WatchedTraining(*self._open(path, actor, env, self.every, TRAINING_PLOTS))
+        recording = self._open(path, actor, env, TRAINING_PLOTS)
+
+        def episodes(step: int) -> EpisodeStream:
+            return EpisodeStream(self._stream(recording, actor, env, 1), self._policy, step)
+
+        return WatchedTraining(recording, self._stream(recording, actor, env, self.every), episodes)
 
     def of_episodes(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
@@ -74,24 +79,38 @@ class Watch:
         Raises:
             SinkError: when file or viewer cannot be had.
         """
-        return WatchedEpisodes(*self._open(path, actor, env, 1, None))
+        recording = self._open(path, actor, env, None)
+        stream = self._stream(recording, actor, env, 1)
+        return WatchedEpisodes(recording, EpisodeStream(stream, self._policy))
+
+    @property
+    def _policy(self) -> str:
+        return "deterministic" if self.deterministic else "stochastic"
 
     def _open(
         self,
         path: Path,
         actor: SafeProbabilisticTensorDictSequential,
         env: EnvBase,
-        every: int,
         plots: Mapping[str, Sequence[str]] | None,
-    ) -> tuple[Recording, FlowStream]:
-        recording = open_recording(
+    ) -> Recording:
+        return open_recording(
             path,
             viewer=self.viewer,
             recording_id=str(path.parent.resolve()),
             blueprint=flow_blueprint(actor, env, projections=self._projections, training=plots),
         )
+
+    def _stream(
+        self,
+        recording: Recording,
+        actor: SafeProbabilisticTensorDictSequential,
+        env: EnvBase,
+        every: int,
+    ) -> FlowStream:
+        """Return a stream to a recording, which is closed where there can be none."""
         try:
-            stream = FlowStream(
+            return FlowStream(
                 recording,
                 actor,
                 env,
@@ -102,21 +121,56 @@ class Watch:
         except BaseException:
             recording.close()
             raise
-        return recording, stream
+
+
+class EpisodeStream:
+    """Stream whole episodes of an evaluation, one after another on the timeline.
+
+    Args:
+        stream: of the policy.
+        policy: which of an evaluation's two, in a word.
+        step: of the first transition, on the timeline.
+    """
+
+    def __init__(self, stream: FlowStream, policy: str, step: int = 0) -> None:
+        self._stream, self._policy = stream, policy
+        self._next_step = step
+        self._episode = 0
+
+    def __call__(self, episode: Sequence[TensorDictBase]) -> None:
+        """Stream the transitions of the next episode."""
+        for number, transition in enumerate(episode):
+            # Counted from 0, as ``cnfp-explain`` does.
+            place = f"episode {self._episode}, step {number} of {len(episode)}"
+            heading = f"Evaluation, {place}, {self._policy} policy"
+            self._stream.log_step(self._next_step, transition, heading)
+            self._next_step += 1
+        self._episode += 1
 
 
 class WatchedTraining:
-    """Stream the first agent of every batch, and the log's scalars.
+    """Stream the first agent of every batch, the log's scalars, and episodes behind them.
 
     Args:
         recording: closed with this.
         stream: of the collector's policy.
+        episodes: returns the stream of episodes that begin at a step of the timeline.
     """
 
-    def __init__(self, recording: Recording, stream: FlowStream) -> None:
+    def __init__(
+        self, recording: Recording, stream: FlowStream, episodes: Callable[[int], EpisodeStream]
+    ) -> None:
         self.loggers = [_SeededLogger("recording", stream=recording.stream)]
         self.see = StreamHook(stream)
         self._recording = recording
+        self._make_episodes = episodes
+        self._episodes: EpisodeStream | None = None
+
+    def see_episode(self, episode: Sequence[TensorDictBase]) -> None:
+        """Stream the transitions of an episode, behind all that was seen before."""
+        if self._episodes is None:
+            self._episodes = self._make_episodes(self.see.frames)
+        self._episodes(episode)
 
     def close(self) -> None:
         """Finish the recording."""
@@ -124,23 +178,16 @@ class WatchedTraining:
 
 
 class WatchedEpisodes:
-    """Stream whole episodes, one after another on the timeline.
+    """Stream whole episodes, and stay for whoever looks at them.
 
     Args:
         recording: closed with this.
-        stream: of the policy.
+        episodes: the stream of them.
     """
 
-    def __init__(self, recording: Recording, stream: FlowStream) -> None:
+    def __init__(self, recording: Recording, episodes: EpisodeStream) -> None:
         self._recording = recording
-        self._stream = stream
-        self._steps = 0
-
-    def see(self, episode: Sequence[TensorDictBase]) -> None:
-        """Stream the transitions of an episode."""
-        for transition in episode:
-            self._stream.log_step(self._steps, transition)
-            self._steps += 1
+        self.see = episodes
 
     def close(self) -> None:
         """Finish the recording, when whoever looks at it has seen enough."""

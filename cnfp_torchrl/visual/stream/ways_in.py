@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NoReturn
 
+import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
@@ -32,7 +34,8 @@ class StreamHook:
         if agent < 0:
             raise ValueError(f"agent: expected an index >= 0, given {agent}")
         self._stream, self._agent = stream, agent
-        self._frames = 0
+        self.frames = 0
+        """Streamed or counted so far, of all agents."""
 
     def __call__(self, batch: TensorDictBase) -> None:
         """Stream a batch ``(*environments, time)``."""
@@ -44,10 +47,10 @@ class StreamHook:
                 f"agent: expected an index below {agents}, the number of environments in a batch "
                 f"of shape {tuple(batch.shape)}, given {self._agent}"
             )
-        steps = batch.reshape(agents, batch.shape[-1])[self._agent]
-        for step in steps.unbind(0):
-            self._stream.log_step(self._frames, step)
-            self._frames += agents
+        place = _place(self._agent, batch.shape[:-1])
+        for time in range(batch.shape[-1]):
+            self._stream.log_step(self.frames, _read_by(self._stream, batch)[(*place, time)])
+            self.frames += agents
 
     def __reduce__(self) -> NoReturn:
         raise _not_to_be_sent("StreamHook")
@@ -74,10 +77,9 @@ class StreamTransform(Transform):
         self._steps = 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        root, after = tensordict.exclude("next"), next_tensordict
-        if root.ndim > 0:
-            root, after = (each.reshape(-1)[self._agent] for each in (root, after))
-        self._stream.log_step(self._steps, root.copy().set("next", after))
+        transition = tensordict.exclude("next").set("next", next_tensordict)
+        place = _place(self._agent, transition.shape)
+        self._stream.log_step(self._steps, _read_by(self._stream, transition)[place])
         self._steps += 1
         return next_tensordict
 
@@ -88,6 +90,19 @@ class StreamTransform(Transform):
 
     def __reduce__(self) -> NoReturn:
         raise _not_to_be_sent("StreamTransform")
+
+
+def _read_by(stream: FlowStream, batch: TensorDictBase) -> TensorDictBase:
+    """Return what the stream will read of its next step.
+
+    To index every entry of a batch takes several times as long as to count a step.
+    """
+    return batch if stream.is_due else batch.select(*stream.counted_keys, strict=False)
+
+
+def _place(agent: int, shape: Sequence[int]) -> tuple[int, ...]:
+    """Return the index of an agent in environments of a shape, by that in the flattened ones."""
+    return tuple(int(each) for each in np.unravel_index(agent, tuple(shape)))
 
 
 def _not_to_be_sent(name: str) -> TypeError:

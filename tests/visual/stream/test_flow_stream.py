@@ -165,6 +165,33 @@ def test_every_so_manieth_step_is_logged_and_all_are_counted(tmp_path: Path) -> 
     assert set(read(path, executed, "Points2D:positions")) == {0, 3, 6}
 
 
+def test_a_second_stream_shows_nothing_of_the_first(tmp_path: Path) -> None:
+    actor = make_actor(CONFLICT)
+    dropped, kept = make_state(CONFLICT), make_state(CONFLICT | {"far": CONFLICT["near"]})
+
+    def write(stream: rr.RecordingStream) -> None:
+        for step, state in enumerate((dropped, kept)):
+            FlowStream(stream, actor, samples=8).log_step(step, actor(state))
+
+    path = record(tmp_path / "recording.rrd", write)
+    lines = read(path, "/stages/2\\ far/own_set_dropped", "LineStrips2D:strips")
+    assert len(lines[0]) > 0
+    assert len(lines[1]) == 0
+
+
+def test_a_heading_begins_the_explanation(tmp_path: Path) -> None:
+    actor = make_actor(PLANE)
+    transition = actor(make_state(PLANE))
+
+    def write(stream: rr.RecordingStream) -> None:
+        flow_stream = FlowStream(stream, actor, samples=8)
+        flow_stream.log_step(0, transition)
+        flow_stream.log_step(1, transition, "The same again")
+
+    words = read(record(tmp_path / "r.rrd", write), "/explanation", "TextDocument:text")
+    assert words[1].item() == f"The same again: {words[0].item()}"
+
+
 def test_projections_are_rows_of_views(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     (step,) = record_steps(path, SPACE, dim=3, steps=1, projections=[(0, 2), (2, 1)])

@@ -17,7 +17,7 @@ from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.stream import FlowStream, StreamHook, StreamTransform
 from tests.visual.cases import Gaussian, make_actor
-from tests.visual.stream.recorded import read, record
+from tests.visual.stream.recorded import compare, read, record
 
 
 def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
@@ -66,6 +66,34 @@ def test_collector_with_a_hook(batch: list[int], agent: int, tmp_path: Path) -> 
     reward = steps["next", "reward"].reshape(3, 4).double()
     expected = reward.cumsum(1).reshape(-1).numpy()
     np.testing.assert_allclose([each.item() for each in returns.values()], expected)
+
+
+@pytest.mark.parametrize("frames", [1, 6])
+@pytest.mark.parametrize(("batch", "agent"), [([2, 2], 2), ([], 0)])
+def test_a_hook_that_leaves_out_steps_records_what_the_stream_does(
+    batch: list[int], agent: int, frames: int, tmp_path: Path
+) -> None:
+    env, actor = pipeline(batch)
+    agents = max(env.batch_size.numel(), 1)
+    rollout = env.rollout(12, actor, break_when_any_done=False)
+
+    def by_hook(stream: rr.RecordingStream) -> None:
+        hook = StreamHook(FlowStream(stream, actor, env, every=5), agent)
+        for part in rollout.split(frames, -1):
+            hook(part)
+        assert hook.frames == 12 * agents
+
+    def by_stream(stream: rr.RecordingStream) -> None:
+        flow_stream = FlowStream(stream, actor, env, every=5)
+        for step, transition in enumerate(rollout.reshape(agents, 12)[agent]):
+            flow_stream.log_step(agents * step, transition)
+
+    one, other = (
+        record(tmp_path / f"{write.__name__}.rrd", write) for write in (by_hook, by_stream)
+    )
+    assert list(read(one, EXECUTED, "Points2D:positions")) == [0, 5 * agents, 10 * agents]
+    same = compare(one, other)
+    assert same.returncode == 0, same.stderr
 
 
 @pytest.mark.parametrize(("batch", "agent"), [([3], 2), ([], 0)])
