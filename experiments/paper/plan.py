@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from hydra.errors import HydraException
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from experiments.paper.collect import PRESENTATION, settings
+from experiments.paper.differences import differences
 from experiments.paper.records import RecordError, load_record
 
 RESERVED = ("experiment", "seed", "collector.total_frames", *PRESENTATION)
@@ -121,7 +121,10 @@ def still_to_do(jobs: Sequence[Job], data: Path) -> list[Job]:
         except RecordError as error:
             reasons.append(f"{error}; move the file away, then the run is repeated")
             continue
-        if differing := _differences(job.settings(), record.config):
+        if differing := [
+            f"{name} ({given}, asked for {wanted})"
+            for name, (given, wanted) in differences(record.config, job.settings()).items()
+        ]:
             reasons.append(
                 f"{path}: expected a run with the configuration asked for, given one that differs "
                 f"in {differing}; choose another folder with --data, or move the file away"
@@ -151,24 +154,3 @@ def fresh_folder(job: Job, runs: Path) -> Path:
             attempt += 1
         else:
             return path
-
-
-def _differences(wanted: dict[str, Any], given: dict[str, Any]) -> list[str]:
-    flat_wanted, flat_given = dict(_flat(wanted)), dict(_flat(given))
-    names = sorted({*flat_wanted, *flat_given})
-    missing = object()
-    return [
-        f"{name} ({flat_given.get(name, 'absent')}, asked for {flat_wanted.get(name, 'absent')})"
-        for name in names
-        if flat_wanted.get(name, missing) != flat_given.get(name, missing)
-    ]
-
-
-def _flat(content: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(content, dict) and content:
-        return [
-            leaf
-            for name, each in content.items()
-            for leaf in _flat(each, f"{prefix}.{name}" if prefix else name)
-        ]
-    return [(prefix, json.dumps(content))]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+from experiments.paper.differences import in_words
 from experiments.paper.hostile import HostileRun, by_flow
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import MODES, Outcome, Record
@@ -125,13 +127,16 @@ def provenance(runs: Runs) -> str:
             ", ".join(str(run.seed) for run in records),
             _all_of(f"{run.steps:,}" for run in records),
             _all_of(" ".join(f"`{o}`" for o in run.overrides) or "none" for run in records),
+            _all_of(in_words(_shared(every[0]), _shared(run)) for run in records),
         ]
         for method, records in runs.items()
     ]
+    heads = ["method", "configuration", "seeds", "training steps", "overrides"]
+    heads.append("what differs from the first method's configuration")
     seconds = sum(run.seconds for run in every)
     return "\n\n".join(
         [
-            table(["method", "configuration", "seeds", "training steps", "overrides"], rows),
+            table(heads, rows),
             f"- Budget: {budgets} environment steps a run, {len(every)} runs, "
             f"{seconds / 3600:.1f} hours of wall time one after the other; runs beside each other "
             "slow each other down, processor seconds less so.\n"
@@ -149,6 +154,11 @@ def provenance(runs: Runs) -> str:
 
 def _all_of(values: Iterable[str]) -> str:
     return ", ".join(sorted(set(values)))
+
+
+def _shared(run: Record) -> dict[str, Any]:
+    """Return what a run's configuration shares with those of other seeds."""
+    return {name: value for name, value in run.config.items() if name != "seed"}
 
 
 def _evaluated(run: Record, constraint: str) -> int:
