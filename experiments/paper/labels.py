@@ -49,6 +49,7 @@ LABELS = {
     ),
     "penalty": Label(Look("reward penalty", "#8C510A", "v"), Kind.LEARNED),
     "unconstrained": Label(Look("unconstrained SAC", "#6E6E6E", "X"), Kind.IGNORED),
+    "none": Label(Look("action bounds alone", "#3A3A3A", "x"), Kind.IGNORED),
 }
 """In the order in which they are shown."""
 
