@@ -56,14 +56,14 @@ class BoxSquash(Bijector):
             )
         self._middle = (image.low + image.high) / 2
         self._half = (image.high - image.low) / 2
-        self._constant = (4 * self._half).log().sum(-1)
+        self._log_slope_scale = (4 * self._half).log()
 
     def about(self, centre: Tensor) -> Self:
         """Return the squash in coordinates about a point ``(*batch, d)``: actions minus it."""
         squash = type(self).__new__(type(self))
         Bijector.__init__(squash)
         squash._middle = self._middle - centre
-        squash._half, squash._constant = self._half, self._constant
+        squash._half, squash._log_slope_scale = self._half, self._log_slope_scale
         return squash
 
     @property
@@ -76,16 +76,25 @@ class BoxSquash(Bijector):
         low, high = self._middle - self._half, self._middle + self._half
         return Box(low, high, validate_args=False)
 
+    def forward_and_log_slopes(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action and each component's log-derivative, both ``(*batch, d)``."""
+        return torch.addcmul(self._middle, self._half, latent.tanh()), self._log_slopes(latent)
+
+    def inverse_and_log_slopes(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the latent and the log-derivatives there of the way forward."""
+        latent = ((action - self._middle) / self._half).atanh()
+        return latent, self._log_slopes(latent)
+
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        action = torch.addcmul(self._middle, self._half, latent.tanh())
-        return action, self._log_det(latent)
+        action, log_slopes = self.forward_and_log_slopes(latent)
+        return action, log_slopes.sum(-1)
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        latent = ((action - self._middle) / self._half).atanh()
-        return latent, -self._log_det(latent)
+        latent, log_slopes = self.inverse_and_log_slopes(action)
+        return latent, -log_slopes.sum(-1)
 
     def contains(self, action: Tensor) -> Tensor:
         return (((action - self._middle) / self._half).abs() < 1).all(-1)
 
-    def _log_det(self, latent: Tensor) -> Tensor:
-        return torch.add(self._constant, log_half_sech(latent).sum(-1), alpha=2)
+    def _log_slopes(self, latent: Tensor) -> Tensor:
+        return torch.add(self._log_slope_scale, log_half_sech(latent), alpha=2)

@@ -20,8 +20,9 @@ class ComponentScale:
 
     def __init__(self, above: Tensor, below: Tensor) -> None:
         self._above, self._below = above, below
-        log_above, self._log_below = above.log(), below.log()
-        self._log_difference = log_above - self._log_below
+        log_above, log_below = above.log(), below.log()
+        self._log_mean = (log_above + log_below) / 2
+        self._log_half_ratio = (log_above - log_below) / 2
 
     @classmethod
     def between(cls, outer: Box, inner: Box) -> Self:
@@ -34,12 +35,12 @@ class ComponentScale:
 
     def inverse(self, scaled: Tensor) -> Tensor:
         """Return the offset of a scaled one."""
-        return _scaled(scaled, 1 / self._above, 1 / self._below)
+        return _scaled(scaled, self._above.reciprocal(), self._below.reciprocal())
 
-    def log_det(self, offset: Tensor) -> Tensor:
-        r"""Return :math:`\sum_i \log \rho_i`, ``(*batch,)``."""
-        ahead = (offset > 0).to(offset.dtype)
-        return torch.addcmul(self._log_below, ahead, self._log_difference).sum(-1)
+    def log_slopes(self, offset: Tensor) -> Tensor:
+        r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
+        # Arithmetic with the sign, because masks are slow to make and to convert.
+        return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
 
 
 def _scaled(offset: Tensor, above: Tensor, below: Tensor) -> Tensor:

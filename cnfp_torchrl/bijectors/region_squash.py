@@ -56,27 +56,26 @@ class RegionSquash(Bijector):
         return region_shape(self.region)
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        offset, log_det = self._box.forward_and_log_det(latent)
-        return self._retraction.forward_and_log_det(offset, log_det)
+        return self._retraction.forward_and_log_det(*self._box.forward_and_log_slopes(latent))
 
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         offset, log_det = self._box.forward_and_log_det(latent)
         return self._retraction.forward(offset), log_det
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        offset = self._retraction.inverse(action)
-        latent, log_det = self._box.inverse_and_log_det(offset)
-        return latent, -self._retraction.forward_and_log_det(offset, -log_det)[1]
+        offset, log_det = self._retraction.inverse_and_log_det(action)
+        latent, box_log_det = self._box.inverse_and_log_det(offset)
+        return latent, log_det + box_log_det
 
     def contains(self, action: Tensor) -> Tensor:
         return self._box.contains(self._retraction.inverse(action))
 
     def stages(self, latent: Tensor) -> Stages:
-        offset, log_det = self._box.forward_and_log_det(latent)
+        offset, log_slopes = self._box.forward_and_log_slopes(latent)
         sets = self.region.sets
         # Each stage is the flow of the constraints so far.
         stages = [
-            self._retraction_into(sets[1:stage]).forward_and_log_det(offset, log_det)
+            self._retraction_into(sets[1:stage]).forward_and_log_det(offset, log_slopes)
             for stage in range(1, len(sets) + 1)
         ]
         actions, log_dets = zip(*stages, strict=True)
@@ -115,11 +114,17 @@ class _Retraction:
             return self._centre + scaled
         return self._contracted(scaled, self._contraction(scaled))
 
-    def forward_and_log_det(self, offset: Tensor, log_det: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action and the log-determinant, this retraction's added to the one given."""
+    def forward_and_log_det(self, offset: Tensor, log_slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action and the log-determinant from the latent on.
+
+        Args:
+            offset: within the action bounds, ``(*batch, d)``.
+            log_slopes: log-derivatives of its components in the latent's, ``(*batch, d)``.
+        """
         scaled = self._scaled(offset)
         if self._scale is not None:
-            log_det = log_det + self._scale.log_det(offset)
+            log_slopes = log_slopes + self._scale.log_slopes(offset)
+        log_det = log_slopes.sum(-1)
         if not self._inner:
             return self._centre + scaled, log_det
         contraction = self._contraction(scaled)
@@ -127,14 +132,29 @@ class _Retraction:
         return self._contracted(scaled, contraction), log_det
 
     def inverse(self, action: Tensor) -> Tensor:
-        scaled = action - self._centre
-        if self._inner:
-            # It depends on the direction alone.
-            scaled = scaled * self._contraction(scaled).unsqueeze(-1)
+        """Return the offset of an action."""
+        scaled, _ = self._expanded(action)
         return scaled if self._scale is None else self._scale.inverse(scaled)
+
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the offset of an action, and the log-determinant of the way back to it."""
+        scaled, contraction = self._expanded(action)
+        log_det = action.shape[-1] * contraction.log()
+        if self._scale is None:
+            return scaled, log_det
+        offset = self._scale.inverse(scaled)
+        return offset, log_det - self._scale.log_slopes(offset).sum(-1)
 
     def _scaled(self, offset: Tensor) -> Tensor:
         return offset if self._scale is None else self._scale.forward(offset)
+
+    def _expanded(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        scaled = action - self._centre
+        if not self._inner:
+            return scaled, torch.ones_like(scaled[..., 0])
+        # It depends on the direction alone.
+        contraction = self._contraction(scaled)
+        return scaled * contraction.unsqueeze(-1), contraction
 
     def _contraction(self, scaled: Tensor) -> Tensor:
         return Rays(scaled, self._outer).contraction(self._inner)

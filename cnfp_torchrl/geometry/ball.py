@@ -30,7 +30,7 @@ def ball_gauge_about(offset: Tensor, radius: Tensor) -> Gauge:
         radius: r, ``(*batch,)``.
     """
     distance = vector_norm(offset, dim=-1)
-    inverse = 1 / ((radius - distance) * (radius + distance))
+    inverse = ((radius - distance) * (radius + distance)).reciprocal()
     return partial(_gauge, offset * inverse.unsqueeze(-1), inverse)
 
 

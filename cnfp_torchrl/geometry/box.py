@@ -41,7 +41,8 @@ class Box(ConstraintSet):
         return self.gauge_about(centre)(direction)
 
     def gauge_about(self, centre: Tensor) -> Gauge:
-        return partial(_gauge, 1 / (self.high - centre), 1 / (centre - self.low))
+        above, below = self.high - centre, centre - self.low
+        return partial(_gauge, above.reciprocal(), below.reciprocal())
 
     def bounding_box(self) -> Box:
         return self

@@ -158,7 +158,7 @@ class ConstraintSet(ABC):
     @property
     def dtype(self) -> torch.dtype:
         """The floating type of the fields."""
-        return next(iter(self.fields().values())).dtype
+        return getattr(self, next(iter(self.event_dims))).dtype
 
     def with_fields(self, change: Callable[[Tensor, int], Tensor]) -> Self:
         """Return the set with each field replaced by a function of it and its event dimensions."""

@@ -59,8 +59,8 @@ class HalfSpaces(ConstraintSet):
         return self.gauge_about(centre)(direction)
 
     def gauge_about(self, centre: Tensor) -> Gauge:
-        inverse = 1 / (self._offsets_and_lengths()[0] - _rows(self.normals, centre))
-        return partial(_gauge, self.normals, inverse)
+        room = self._offsets_and_lengths()[0] - _rows(self.normals, centre)
+        return partial(_gauge, self.normals, room.reciprocal())
 
     def bounding_box(self) -> Box:
         """Return the bounds that single rows with one component set; the others are infinite."""

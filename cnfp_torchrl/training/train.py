@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
@@ -20,7 +20,7 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.environment import counted_constraints
-from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
+from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings
@@ -114,23 +114,11 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         watched: dict[bool, EpisodeCollector] = {}
         if watch is not None:
             watched[watch.deterministic] = EpisodeCollector(first_episodes(watch, judgement))
-        results = {
-            name: _evaluate(config, actor, judgement, deterministic=each, see=watched.get(each))
-            for name, each in {"stochastic": False, "deterministic": True}.items()
-        }
-        violations = {
-            name: count + sum(result.violations[name] for result in results.values())
-            for name, count in metrics.violations.items()
-        }
-        stochastic = results["stochastic"].report(score)
+        results = _evaluations(config, actor, judgement, watched)
         summary = {
-            "return_mean": stochastic["return_mean"],
-            "score": stochastic["score"],
-            "violations": violations,
+            **_results(metrics, results, score),
             "steps": metrics.frames,
             "seconds": time.perf_counter() - started,
-            "training_violations": metrics.violations,
-            "evaluation": {name: result.report(score) for name, result in results.items()},
             "flow": type(flow_head(actor).flow).__name__,
             "order": list(config.flow.order),
             "seed": config.seed,
@@ -143,16 +131,41 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     return summary
 
 
-def _evaluate(
+def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
     settings: EvaluationSettings,
-    *,
-    deterministic: bool,
-    see: Callable[[TensorDictBase], None] | None,
-) -> Evaluation:
-    env = build_environment(config, batch_size=[settings.episodes])
-    return evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic, see=see)
+    watched: Mapping[bool, EpisodeCollector],
+) -> dict[str, Evaluation]:
+    """Evaluate the stochastic policy and the deterministic one; collect episodes of the watched."""
+    return {
+        name: evaluate_seeded(
+            build_environment(config, batch_size=[settings.episodes]),
+            guarded(actor),
+            settings,
+            deterministic=deterministic,
+            see=watched.get(deterministic),
+        )
+        for name, deterministic in {"stochastic": False, "deterministic": True}.items()
+    }
+
+
+def _results(
+    metrics: Metrics, evaluations: Mapping[str, Evaluation], score: LinearScore | None
+) -> dict[str, Any]:
+    """Return what the summary says of training and evaluations; violations are of them all."""
+    reports = {name: each.report(score) for name, each in evaluations.items()}
+    violations = {
+        name: count + sum(each.violations[name] for each in evaluations.values())
+        for name, count in metrics.violations.items()
+    }
+    return {
+        "return_mean": reports["stochastic"]["return_mean"],
+        "score": reports["stochastic"]["score"],
+        "violations": violations,
+        "training_violations": metrics.violations,
+        "evaluation": reports,
+    }
 
 
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")

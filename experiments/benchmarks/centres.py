@@ -160,9 +160,9 @@ def _random_set(rng: np.random.Generator, anchor: Array, slack: Array) -> Constr
     terms = np.abs(terms) if family is WeightedL1Ball else np.maximum(terms, 0)
     bound = terms.sum(-1) + slack * np.linalg.norm(weights, axis=-1)
     bound = np.maximum(bound, 1e-3 * scale[:, 0])
-    return (WeightedL1Ball if family is WeightedL1Ball else PositivePart)(
-        tensor(weights), tensor(bound)
-    )
+    if family is WeightedL1Ball:
+        return WeightedL1Ball(tensor(weights), tensor(bound))
+    return PositivePart(tensor(weights), tensor(bound))
 
 
 def scipy_best_slack(sets: list[ConstraintSet], index: int) -> float:
