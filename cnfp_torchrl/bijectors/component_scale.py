@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry import Box
+from cnfp_torchrl.geometry.box import sides
 
 
 class ComponentScale:
@@ -29,13 +30,14 @@ class ComponentScale:
         """Return the scale that takes one box onto another, each with 0 inside."""
         return cls(inner.high / outer.high, inner.low / outer.low)
 
-    def forward(self, offset: Tensor) -> Tensor:
-        """Return the scaled offset ``(*batch, d)``."""
-        return _scaled(offset, self._above, self._below)
+    def forward(self, ahead: Tensor, behind: Tensor) -> Tensor:
+        """Return the scaled offset ``(*batch, d)`` of an offset given by its `sides`."""
+        return _joined(ahead * self._above, behind, self._below)
 
     def inverse(self, scaled: Tensor) -> Tensor:
         """Return the offset of a scaled one."""
-        return _scaled(scaled, self._above.reciprocal(), self._below.reciprocal())
+        ahead, behind = sides(scaled)
+        return _joined(ahead / self._above, behind, self._below.reciprocal())
 
     def log_slopes(self, offset: Tensor) -> Tensor:
         r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
@@ -43,6 +45,5 @@ class ComponentScale:
         return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
 
 
-def _scaled(offset: Tensor, above: Tensor, below: Tensor) -> Tensor:
-    ahead = offset.relu()
-    return torch.addcmul(ahead * above, offset - ahead, below)
+def _joined(ahead: Tensor, behind: Tensor, below: Tensor) -> Tensor:
+    return torch.addcmul(ahead, behind, below, value=-1)

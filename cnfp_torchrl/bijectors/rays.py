@@ -48,26 +48,24 @@ def region_shape(region: Region) -> torch.Size:
 class Rays:
     """The rays from a centre through points of an outer set.
 
-    `progress` is the share of the way to the outer boundary at which a point lies, the outer gauge
-    of its offset, and `direction` its ray, ``(*batch, d)``.
-
     Args:
         offset: points minus the centre, ``(*batch, d)``.
-        outer: the outer set's gauge about the centre.
+        progress: the share of the way to the outer boundary at which each point lies, the outer
+            set's gauge of its offset, ``(*batch,)``.
     """
 
-    def __init__(self, offset: Tensor, outer: Gauge) -> None:
+    def __init__(self, offset: Tensor, progress: Tensor) -> None:
         # In one dimension a direction is a sign and has no gradient; computed, its exact zero would
         # be rounding error over the length.
-        offset = offset.detach() if offset.shape[-1] == 1 else offset
-        self.progress = outer(offset)
+        if offset.shape[-1] == 1:
+            offset, progress = offset.detach(), progress.detach()
         # An offset of zero has no direction, and one so short that gradients, which grow like
         # 1/length, could overflow when squared, has none to speak of. It is given one, so that
         # nothing becomes NaN, and a way to the boundary on which no set binds.
         shortest = torch.finfo(offset.dtype).tiny ** 0.4
-        zero = self.progress <= shortest
-        self.direction = offset + zero.unsqueeze(-1)
-        self._outer = threshold(self.progress, shortest, torch.inf)
+        zero = progress <= shortest
+        self._direction = offset + zero.unsqueeze(-1)
+        self._outer = threshold(progress, shortest, torch.inf)
 
     def contraction(self, inner: Sequence[Gauge]) -> Tensor:
         """Return by what a way through the outer set is divided to end in the inner ones as well.
@@ -79,7 +77,7 @@ class Rays:
         Args:
             inner: the gauges of one or more inner sets about the centre.
         """
-        gauges = [gauge(self.direction) for gauge in inner]
+        gauges = [gauge(self._direction) for gauge in inner]
         if len(gauges) == 1:
             largest = gauges[0]
         else:

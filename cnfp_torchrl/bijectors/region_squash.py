@@ -13,6 +13,7 @@ from cnfp_torchrl.bijectors.box_squash import BoxSquash
 from cnfp_torchrl.bijectors.component_scale import ComponentScale
 from cnfp_torchrl.bijectors.rays import Rays, region_shape
 from cnfp_torchrl.geometry import Box, ConstraintSet, Region
+from cnfp_torchrl.geometry.box import gauge_of_sides, sides
 
 
 class RegionSquash(Bijector):
@@ -96,23 +97,20 @@ class _Retraction:
         self, bounds: Box, boxes: Sequence[Box], others: Sequence[ConstraintSet], centre: Tensor
     ) -> None:
         self._centre = centre
+        self._above, self._below = bounds.high.reciprocal(), -bounds.low.reciprocal()
         self._scale = None
-        inner = bounds
         if boxes:
+            inner = bounds
             for box in boxes:
                 low = torch.maximum(inner.low, box.low - centre)
                 high = torch.minimum(inner.high, box.high - centre)
                 inner = Box(low, high, validate_args=False)
             self._scale = ComponentScale.between(bounds, inner)
-        if others:
-            self._outer = inner.gauge_about(centre.new_zeros(()))
         self._inner = [each.gauge_about(centre) for each in others]
 
     def forward(self, offset: Tensor) -> Tensor:
-        scaled = self._scaled(offset)
-        if not self._inner:
-            return self._centre + scaled
-        return self._contracted(scaled, self._contraction(scaled))
+        scaled, contraction = self._scaled_and_contraction(offset)
+        return self._contracted(scaled, contraction)
 
     def forward_and_log_det(self, offset: Tensor, log_slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Return the action and the log-determinant from the latent on.
@@ -121,44 +119,44 @@ class _Retraction:
             offset: within the action bounds, ``(*batch, d)``.
             log_slopes: log-derivatives of its components in the latent's, ``(*batch, d)``.
         """
-        scaled = self._scaled(offset)
+        scaled, contraction = self._scaled_and_contraction(offset)
         if self._scale is not None:
             log_slopes = log_slopes + self._scale.log_slopes(offset)
         log_det = log_slopes.sum(-1)
-        if not self._inner:
-            return self._centre + scaled, log_det
-        contraction = self._contraction(scaled)
-        log_det = torch.sub(log_det, contraction.log(), alpha=offset.shape[-1])
+        if contraction is not None:
+            log_det = torch.sub(log_det, contraction.log(), alpha=offset.shape[-1])
         return self._contracted(scaled, contraction), log_det
 
     def inverse(self, action: Tensor) -> Tensor:
         """Return the offset of an action."""
-        scaled, _ = self._expanded(action)
-        return scaled if self._scale is None else self._scale.inverse(scaled)
+        return self.inverse_and_log_det(action)[0]
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the offset of an action, and the log-determinant of the way back to it."""
-        scaled, contraction = self._expanded(action)
-        log_det = action.shape[-1] * contraction.log()
-        if self._scale is None:
-            return scaled, log_det
-        offset = self._scale.inverse(scaled)
-        return offset, log_det - self._scale.log_slopes(offset).sum(-1)
+        offset = action - self._centre
+        if self._scale is not None:
+            offset = self._scale.inverse(offset)
+        # It depends on the direction alone, as the component scale does.
+        _, contraction = self._scaled_and_contraction(offset)
+        log_det = torch.zeros_like(offset[..., 0])
+        if contraction is not None:
+            offset = offset * contraction.unsqueeze(-1)
+            log_det = offset.shape[-1] * contraction.log()
+        if self._scale is not None:
+            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
+        return offset, log_det
 
-    def _scaled(self, offset: Tensor) -> Tensor:
-        return offset if self._scale is None else self._scale.forward(offset)
-
-    def _expanded(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        scaled = action - self._centre
+    def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the offset after the boxes, and by what it is to be divided for other sets."""
+        ahead, behind = sides(offset)
+        scaled = offset if self._scale is None else self._scale.forward(ahead, behind)
         if not self._inner:
-            return scaled, torch.ones_like(scaled[..., 0])
-        # It depends on the direction alone.
-        contraction = self._contraction(scaled)
-        return scaled * contraction.unsqueeze(-1), contraction
+            return scaled, None
+        progress = gauge_of_sides(self._above, self._below, ahead, behind)
+        return scaled, Rays(scaled, progress).contraction(self._inner)
 
-    def _contraction(self, scaled: Tensor) -> Tensor:
-        return Rays(scaled, self._outer).contraction(self._inner)
-
-    def _contracted(self, scaled: Tensor, contraction: Tensor) -> Tensor:
+    def _contracted(self, scaled: Tensor, contraction: Tensor | None) -> Tensor:
+        if contraction is None:
+            return self._centre + scaled
         # Not a quotient: its gradient takes more passes.
         return torch.addcmul(self._centre, scaled, contraction.reciprocal().unsqueeze(-1))

@@ -52,8 +52,8 @@ class Retraction(Bijector):
         return latent, action.shape[-1] * contraction.log()
 
     def contains(self, action: Tensor) -> Tensor:
-        rays = Rays(action - self._centre, self._outer_gauge)
-        return rays.progress * rays.contraction([self._inner_gauge]) < 1
+        offset = action - self._centre
+        return self._outer_gauge(offset) * self._contraction(offset) < 1
 
     def _contraction(self, offset: Tensor) -> Tensor:
-        return Rays(offset, self._outer_gauge).contraction([self._inner_gauge])
+        return Rays(offset, self._outer_gauge(offset)).contraction([self._inner_gauge])

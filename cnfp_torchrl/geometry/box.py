@@ -78,8 +78,24 @@ class Box(ConstraintSet):
         return Rows(torch.cat([identity, -identity]), offsets, torch.ones_like(offsets))
 
 
+def sides(offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far each component goes to the high and to the low side, ``(*batch, d)``, >= 0."""
+    # Not two maxima: the gradient of each costs more than that of both parts together.
+    ahead = offset.relu()
+    return ahead, ahead - offset
+
+
+def gauge_of_sides(above: Tensor, below: Tensor, ahead: Tensor, behind: Tensor) -> Tensor:
+    """Return the gauge of a box, ``(*batch,)``, at an offset from a centre given by its `sides`.
+
+    Args:
+        above: inverse distances from the centre to the high bounds, ``(*batch, d)``.
+        below: inverse distances to the low bounds, ``(*batch, d)``.
+        ahead: of the offset, ``(*batch, d)``.
+        behind: of the offset, ``(*batch, d)``.
+    """
+    return torch.addcmul(ahead * above, behind, below).amax(-1)
+
+
 def _gauge(above: Tensor, below: Tensor, direction: Tensor) -> Tensor:
-    """Return the gauge of a box from the inverse distances to its bounds, each ``(*batch, d)``."""
-    # Not the larger of two products: its gradient costs three times as much.
-    ahead = direction.relu()
-    return torch.addcmul(ahead * above, ahead - direction, below).amax(-1)
+    return gauge_of_sides(above, below, *sides(direction))
