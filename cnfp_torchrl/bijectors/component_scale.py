@@ -22,8 +22,8 @@ class ComponentScale:
     def __init__(self, above: Tensor, below: Tensor) -> None:
         self._above, self._below = above, below
         log_above, log_below = above.log(), below.log()
-        self._log_mean = (log_above + log_below) / 2
-        self._log_half_ratio = (log_above - log_below) / 2
+        self._log_mean = torch.lerp(log_below, log_above, 0.5)
+        self._log_half_ratio = log_above - self._log_mean
 
     @classmethod
     def between(cls, outer: Box, inner: Box) -> Self:
