@@ -33,7 +33,7 @@ class ConstrainedFlow(TransformedDistribution):
 
     Raises:
         ValueError: when the base is not a distribution over vectors of the bijector's dimension,
-            or, on sampling, is one of half precision.
+            or, on sampling, is one of half precision or of a coarser dtype than the bijector.
     """
 
     def __init__(self, base: Distribution, bijector: Bijector) -> None:
@@ -61,7 +61,7 @@ class ConstrainedFlow(TransformedDistribution):
         """Return reparametrised actions ``(*sample, *batch, d)`` and their log-densities."""
         latent, latent_log_prob = _rsample_and_log_prob(self.base_dist, torch.Size(sample_shape))
         action, log_det = self._forward_and_scored_log_det(_checked(latent))
-        return action, latent_log_prob - log_det
+        return _in_dtype_of(latent, action), latent_log_prob - log_det
 
     def sample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
         """Return actions ``(*sample, *batch, d)`` without gradients and their log-densities.
@@ -71,16 +71,16 @@ class ConstrainedFlow(TransformedDistribution):
         latent = _checked(self.base_dist.sample(torch.Size(sample_shape)))
         with torch.no_grad():
             action, log_det = self._forward_and_scored_log_det(latent)
-        return action, self.base_dist.log_prob(latent) - log_det
+        return _in_dtype_of(latent, action), _log_prob(self.base_dist, latent) - log_det
 
     def rsample(self, sample_shape: Shape = ()) -> Tensor:
         """Return reparametrised actions ``(*sample, *batch, d)``."""
-        return self.bijector(_checked(self.base_dist.rsample(torch.Size(sample_shape))))
+        return self._pushed(self.base_dist.rsample(torch.Size(sample_shape)))
 
     def sample(self, sample_shape: Shape = ()) -> Tensor:
         """Return actions ``(*sample, *batch, d)`` without gradients."""
         with torch.no_grad():
-            return self.bijector(_checked(self.base_dist.sample(torch.Size(sample_shape))))
+            return self._pushed(self.base_dist.sample(torch.Size(sample_shape)))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density of actions by inversion, -inf outside the support.
@@ -88,11 +88,12 @@ class ConstrainedFlow(TransformedDistribution):
         A NaN action has a NaN density. On the boundary, where saturated actions of float32 may lie,
         the density's limit is taken: -inf.
         """
-        outside = ~(self.bijector.contains(value) | value.isnan().any(-1))
+        inside, undefined = self.bijector.contains(value), value.isnan().any(-1)
         interior = self.bijector(torch.zeros_like(value))
-        inside_value = torch.where(outside.unsqueeze(-1), interior, value)
+        inside_value = torch.where(inside.unsqueeze(-1), value, interior)
         latent, log_det = self.bijector.inverse_and_log_det(inside_value)
-        return torch.where(outside, -torch.inf, self.base_dist.log_prob(latent) + log_det)
+        elsewhere = torch.where(undefined, torch.nan, -torch.inf).to(log_det)
+        return torch.where(inside, _log_prob(self.base_dist, latent) + log_det, elsewhere)
 
     def stages(self, latent: Tensor) -> Stages:
         """Return intermediate actions and log-determinants of latents ``(*sample, *batch, d)``."""
@@ -101,7 +102,7 @@ class ConstrainedFlow(TransformedDistribution):
     @property
     def deterministic_sample(self) -> Tensor:
         """The base mean pushed through the flow, ``(*batch, d)``: the action without noise."""
-        return self.bijector(_checked(self.base_dist.mean))
+        return self._pushed(self.base_dist.mean)
 
     @property
     def mode(self) -> Tensor:
@@ -116,6 +117,9 @@ class ConstrainedFlow(TransformedDistribution):
         samples, which can lie outside a non-convex set.
         """
         return self.deterministic_sample
+
+    def _pushed(self, latent: Tensor) -> Tensor:
+        return _in_dtype_of(latent, self.bijector(_checked(latent)))
 
     def _forward_and_scored_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         return self.bijector.forward_and_log_det(latent)
@@ -156,14 +160,24 @@ def _checked(latent: Tensor) -> Tensor:
     return latent
 
 
+def _in_dtype_of(latent: Tensor, action: Tensor) -> Tensor:
+    if action.dtype != latent.dtype:
+        raise ValueError(
+            f"base: expected samples of {action.dtype}, as the bijector's sets are, given "
+            f"{latent.dtype}, whose rounding errors exceed the margin that the sets leave; "
+            "convert the base's parameters or the sets"
+        )
+    return action
+
+
 def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor, Tensor]:
     """Draw from a base and score the draw.
 
     A Gaussian's noise is scored where it is drawn: recovering it as (z - loc) / scale would lose it
     to rounding where the scale is small beside the location, and costs more.
     """
-    gaussian = base.base_dist if isinstance(base, Independent) else None
-    if type(gaussian) is not Normal or len(gaussian.batch_shape) != len(base.batch_shape) + 1:
+    gaussian = _gaussian(base)
+    if gaussian is None:
         latent = base.rsample(shape)
         return latent, base.log_prob(latent)
     loc, scale = gaussian.loc, gaussian.scale
@@ -171,3 +185,17 @@ def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor
     surprise = torch.addcmul(scale.log(), noise, noise, value=0.5).sum(-1)
     constant = -0.5 * math.log(2 * math.pi) * loc.shape[-1]
     return torch.addcmul(loc, scale, noise), constant - surprise
+
+
+def _log_prob(base: Distribution, latent: Tensor) -> Tensor:
+    # `Independent` cannot score an empty batch.
+    gaussian = _gaussian(base)
+    return base.log_prob(latent) if gaussian is None else gaussian.log_prob(latent).sum(-1)
+
+
+def _gaussian(base: Distribution) -> Normal | None:
+    """Return the independent Gaussians that a base is made of, None if it is something else."""
+    gaussian = base.base_dist if isinstance(base, Independent) else None
+    if type(gaussian) is not Normal or len(gaussian.batch_shape) != len(base.batch_shape) + 1:
+        return None
+    return gaussian

@@ -383,6 +383,22 @@ def test_bad_bases_are_refused() -> None:
             ConstrainedFlow(base, plane)
 
 
+def test_a_coarser_base_is_refused() -> None:
+    """Its rounding errors exceed the margin of sets of float64."""
+    base = gaussian(torch.zeros(2), torch.ones(2))
+    distribution = ConstrainedFlow(base, BY_NAME["gauge-ball-d2"].build(torch.float64))
+    message = "base: expected samples of torch.float64, as the bijector's sets are, given torch.flo"
+    for draw in (
+        distribution.rsample_and_log_prob,
+        distribution.sample_and_log_prob,
+        distribution.rsample,
+        distribution.sample,
+        lambda: distribution.mode,
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            draw()
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_refused(dtype: torch.dtype) -> None:
     base = gaussian(torch.zeros(2, dtype=dtype), torch.ones(2, dtype=dtype))
@@ -397,6 +413,25 @@ def test_half_precision_is_refused(dtype: torch.dtype) -> None:
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             draw()
+
+
+def test_a_base_that_checks_its_arguments() -> None:
+    base = Independent(Normal(torch.zeros(2), torch.ones(2), validate_args=True), 1)
+    distribution = ConstrainedFlow(base, BY_NAME["gauge-ball-d2"].build(torch.float32))
+    assert distribution.log_prob(torch.tensor([torch.nan, 0.0])).isnan()
+    assert distribution.log_prob(torch.tensor([torch.inf, 0.0])) == -torch.inf
+
+
+@pytest.mark.parametrize("batch", [(0,), (2, 0), (0, 3)])
+def test_empty_batches(batch: tuple[int, ...]) -> None:
+    base = gaussian(torch.zeros(*batch, 2), torch.ones(*batch, 2))
+    distribution = ConstrainedFlow(base, BY_NAME["gauge-ball-d2"].build(torch.float32))
+    for action, log_prob in (
+        distribution.rsample_and_log_prob(),
+        distribution.sample_and_log_prob(),
+    ):
+        assert action.shape == (*batch, 2)
+        assert log_prob.shape == distribution.log_prob(action).shape == batch
 
 
 def test_nothing_here_depends_on_numpys_random_numbers() -> None:

@@ -32,18 +32,14 @@ class ComponentScale:
 
     def forward(self, ahead: Tensor, behind: Tensor) -> Tensor:
         """Return the scaled offset ``(*batch, d)`` of an offset given by its `sides`."""
-        return _joined(ahead * self._above, behind, self._below)
+        return torch.addcmul(ahead * self._above, behind, self._below, value=-1)
 
     def inverse(self, scaled: Tensor) -> Tensor:
         """Return the offset of a scaled one."""
         ahead, behind = sides(scaled)
-        return _joined(ahead / self._above, behind, self._below.reciprocal())
+        return torch.addcdiv(ahead / self._above, behind, self._below, value=-1)
 
     def log_slopes(self, offset: Tensor) -> Tensor:
         r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
         # Arithmetic with the sign, because masks are slow to make and to convert.
         return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
-
-
-def _joined(ahead: Tensor, behind: Tensor, below: Tensor) -> Tensor:
-    return torch.addcmul(ahead, behind, below, value=-1)

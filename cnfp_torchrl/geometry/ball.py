@@ -90,8 +90,11 @@ class Ball(ConstraintSet):
         return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
 
     def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
-        # The radius alone, because torch.where is slow where the mask broadcasts.
-        beyond = vector_norm(centre - self.center, dim=-1) + radius
+        # The radius alone, because torch.where is slow where the mask broadcasts. A far centre's
+        # distance is known up to rounding error, which may be larger than what is to be added.
+        distance = vector_norm(centre - self.center, dim=-1)
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        beyond = torch.add(distance, distance, alpha=eps) + radius
         return type(self)(
             self.center, torch.where(active, self.radius, beyond), validate_args=False
         )

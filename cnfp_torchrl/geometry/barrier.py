@@ -39,12 +39,13 @@ def maximise_slack(
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
     Stops for each problem as soon as the slack is at least `enough` and a share of the upper bound,
-    or the upper bound is below `enough`.
+    or the upper bound is below `enough`: at once where a set is so far from the bounds that its
+    Lipschitz slack says so, which Newton's method could not tell from rounding error.
 
     Args:
-        problem: B problems in float64.
-        start: any actions, ``(B, d)``.
-        scale: a length that says how large the problems are, positive, ``(B,)``.
+        problem: B problems in float64, with rows that bound the actions on all sides.
+        start: the middles of these bounds, ``(B, d)``.
+        scale: the mean widths of these bounds, ``(B,)``.
         enough: the smallest slack of interest.
         share: the share of the best slack that will do, below 1.
 
@@ -52,7 +53,10 @@ def maximise_slack(
         RuntimeError: when a problem is undecided after `MAX_ITERATIONS`.
     """
     at = problem.start(start, scale)
-    found = Best(start.clone(), problem.slack(start), torch.full_like(scale, torch.inf))
+    # Half of the bounds' diagonal at most; outside of the bounds the slack is negative.
+    reach = scale * start.shape[-1] / 2
+    upper_bound = problem.bound_within(start, reach).clamp(min=0)
+    found = Best(start.clone(), problem.slack(start), upper_bound)
     # The eta for which the start is best in t.
     eta = _pull_on_slack(problem, at)
     nu = problem.barrier_parameter()

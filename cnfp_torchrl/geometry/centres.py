@@ -32,8 +32,10 @@ def lexicographic_centre(
 
     :math:`S = A_0`; for k from the highest priority K down to 1: if S and :math:`A_k` have a common
     point with the minimum slack, :math:`S = S \cap A_k`, else :math:`A_k` is inactive in this
-    state. A set is dropped only on a certified upper bound of the slack below the minimum. Slack is
-    counted in sets eroded for rounding error twice: once for the actions, once for the centre.
+    state. A convex set is dropped only on a certified upper bound of the slack below the minimum.
+    Of non-convex sets convex parts are tried: those of the most room, those near a point that all
+    convex sets have in common, and those near a point of what is kept so far. Slack is counted in
+    sets eroded for rounding error twice: once for the actions, once for the centre.
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
@@ -81,6 +83,7 @@ def chebyshev_centre(
     active: Tensor | None = None,
     enough: float = MINIMUM_SLACK,
     share: float = 0.5,
+    near: Tensor | None = None,
 ) -> Best:
     """Find points whose smallest slack in all sets is a large share of the best one.
 
@@ -94,6 +97,8 @@ def chebyshev_centre(
         active: which sets count, boolean ``(B, len(sets))``; None means all.
         enough: the smallest slack of interest, in action units.
         share: the share of the best slack that will do, below 1.
+        near: of non-convex sets the parts near these points count, ``(B, d)``; None means those
+            that `ConstraintSet.superlevel` describes.
 
     Returns:
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
@@ -114,7 +119,7 @@ def chebyshev_centre(
         active = bounds.low.new_ones(*bounds.batch_shape, len(sets)).bool()
     start = (bounds.low + bounds.high) / 2
     scale = (bounds.high - bounds.low).mean(-1)
-    parts = [each.superlevel() for each in wide]
+    parts = [each.superlevel() if near is None else each.part_near(near) for each in wide]
     described = [i for i, part in enumerate(parts) if part is not None]
     known = [part for part in parts if part is not None]
     problem = Program.stack(known, active[:, described])
@@ -128,26 +133,53 @@ def chebyshev_centre(
 
 def _search(sets: Sequence[ConstraintSet], minimum_slack: float) -> tuple[Tensor, Tensor]:
     """Apply the lexicographic rule by the general method to sets of batch shape ``(B,)``."""
-    best = chebyshev_centre(sets, None, minimum_slack)
-    point, together = best.action, best.upper_bound >= minimum_slack
+    bounds = sets[0]
+    assert isinstance(bounds, Box)
+    centre = ((bounds.low + bounds.high) / 2).double()
+    everything = torch.ones(len(centre), len(sets), dtype=torch.bool, device=centre.device)
+    point, together = _common_point(sets, everything, centre, minimum_slack)
     active = together.unsqueeze(-1).repeat(1, len(sets))
     active[:, 0] = True
     index = (~together).nonzero().squeeze(-1)
     if not len(index):
         return point, active
     sets = [each.select(together.shape, index) for each in sets]
-    chosen = active[index]
-    bounds = sets[0]
-    assert isinstance(bounds, Box)
-    centre = ((bounds.low + bounds.high) / 2).double()
+    chosen, centre = active[index], centre[index]
     for k in range(len(sets) - 1, 0, -1):
         trial = chosen.clone()
         trial[:, k] = True
-        best = chebyshev_centre(sets, trial, minimum_slack)
-        fits = best.upper_bound >= minimum_slack
+        found, fits = _common_point(sets, trial, centre, minimum_slack)
         chosen[:, k] = fits
-        centre = torch.where(fits.unsqueeze(-1), best.action, centre)
+        centre = torch.where(fits.unsqueeze(-1), found, centre)
     return point.index_copy(0, index, centre), active.index_copy(0, index, chosen)
+
+
+def _common_point(
+    sets: Sequence[ConstraintSet], active: Tensor, kept: Tensor, minimum_slack: float
+) -> tuple[Tensor, Tensor]:
+    """Return points well inside all active sets of a batch ``(B,)``, and where there are such.
+
+    Args:
+        sets: the first are the action bounds.
+        active: boolean ``(B, len(sets))``.
+        kept: points of all active sets but the last one, ``(B, d)``.
+        minimum_slack: of the points.
+    """
+    best = chebyshev_centre(sets, active, minimum_slack)
+    point, fits = best.action, best.upper_bound >= minimum_slack
+    convex = [type(each).part_near is ConstraintSet.part_near for each in sets]
+    if all(convex) or bool(fits.all()):
+        return point, fits
+    of_convex = active & torch.tensor(convex, device=active.device)
+    for near in (chebyshev_centre(sets, of_convex, minimum_slack).action, kept):
+        index = (~fits).nonzero().squeeze(-1)
+        if not len(index):
+            break
+        hard = [each.select(fits.shape, index) for each in sets]
+        best = chebyshev_centre(hard, active[index], minimum_slack, near=near[index])
+        point = point.index_copy(0, index, best.action)
+        fits = fits.index_copy(0, index, best.upper_bound >= minimum_slack)
+    return point, fits
 
 
 def _from_candidate(

@@ -47,7 +47,7 @@ class ConstraintSet(ABC):
     - `gauge_about`: the gauge with all that does not depend on the direction computed once,
     - `violations`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
-    - `superlevel`: what the search for centres needs to be fast.
+    - `superlevel`: what the search for centres needs to be fast, `part_near` if not convex.
 
     Constructing a set checks it, which reads tensors on the host. Hot paths, whose values were
     checked where they entered, construct with ``validate_args=False``.
@@ -108,7 +108,7 @@ class ConstraintSet(ABC):
         Args:
             centre: ``(*batch, d)``, strictly inside the set.
         """
-        return partial(self.gauge, centre=centre)
+        return partial(_gauge_at, self, centre)
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
@@ -134,9 +134,20 @@ class ConstraintSet(ABC):
         """Describe the actions with a slack of at least t, for the search for centres.
 
         None, the default, makes the search linearise `slack` instead: right for any concave slack,
-        but slower. A non-convex family describes a convex part of its set.
+        but slower. A non-convex family describes a convex part of its set, and others by
+        `part_near`.
         """
         return None
+
+    def part_near(self, point: Tensor) -> Superlevel | None:
+        """Describe a convex part with as much slack at a point as the whole set has, for a search.
+
+        A convex family, which has but one part, leaves this as it is.
+
+        Args:
+            point: ``(*batch, d)``.
+        """
+        return self.superlevel()
 
     # What follows from it -------------------------------------------------------------------------
 
@@ -159,6 +170,13 @@ class ConstraintSet(ABC):
     def dtype(self) -> torch.dtype:
         """The floating type of the fields."""
         return getattr(self, next(iter(self.event_dims))).dtype
+
+    def to(self, dtype: torch.dtype) -> Self:
+        """Return the set with all fields converted to a dtype, itself where they have it.
+
+        Rounding the fields moves the boundary by less than `eroded` does.
+        """
+        return self if self.dtype == dtype else self.with_fields(lambda field, _: field.to(dtype))
 
     def with_fields(self, change: Callable[[Tensor, int], Tensor]) -> Self:
         """Return the set with each field replaced by a function of it and its event dimensions."""
@@ -270,3 +288,7 @@ class ConstraintSet(ABC):
         raise GeometryError(
             f"{where}, field '{field}'{at}: expected {expected}, given {given.tolist()}"
         )
+
+
+def _gauge_at(sets: ConstraintSet, centre: Tensor, direction: Tensor) -> Tensor:
+    return sets.gauge(direction, centre)

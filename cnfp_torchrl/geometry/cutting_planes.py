@@ -34,8 +34,8 @@ def maximise_slack_by_cuts(
         problem: B problems in float64, without the sets.
         sets: the further sets, each of batch shape ``(B,)``, in float64.
         active: which of them count, boolean ``(B, len(sets))``.
-        start: any actions, ``(B, d)``.
-        scale: a length that says how large the problems are, positive, ``(B,)``.
+        start: the middles of the action bounds, ``(B, d)``.
+        scale: their mean widths, ``(B,)``.
         enough: the smallest slack of interest.
         share: the share of the best slack that will do, below 1.
 

@@ -89,7 +89,17 @@ class Region:
 
         A dropped set is replaced by one of its family that reaches beyond the action bounds, so
         that all sets of the result are active: nothing needs a mask, and no gradient is NaN.
+
+        Raises:
+            GeometryError: when sets and centre have several dtypes, in the coarser ones of which
+                the erosion by the finer one's rounding error is none.
         """
+        dtypes = [each.dtype for each in self.sets]
+        if any(dtype != self.centre.dtype for dtype in dtypes):
+            raise GeometryError(
+                f"sets and centre: expected one dtype, given {dtypes} and {self.centre.dtype}; "
+                "convert them with .to(dtype)"
+            )
         magnitude = self.bounds.magnitude()
         sets = [each.eroded(magnitude) for each in self.sets]
         if self.active is not None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 from torch.nn.functional import pad
 
+from cnfp_torchrl.geometry.matrix_norm import spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 
 
@@ -132,14 +133,34 @@ class Program:
 
     def slack(self, action: Tensor) -> Tensor:
         """Return the smallest slack at an action, ``(B,)``."""
+        return self._smallest(self._rooms(action))
+
+    def bound_within(self, action: Tensor, distance: Tensor) -> Tensor:
+        """Return an upper bound of the smallest slack within a distance of an action, ``(B,)``."""
+        kinks = torch.maximum(self.upper.abs(), self.lower.abs())
+        steepness = torch.cat(
+            [
+                vector_norm(self.rows, dim=-1),
+                spectral_norm_bound(self.matrices),
+                vector_norm(kinks, dim=-1),
+            ],
+            -1,
+        )
+        return self._smallest(self._rooms(action) + steepness * distance.unsqueeze(-1))
+
+    def _rooms(self, action: Tensor) -> Tensor:
+        """Return by how much each inequality holds at a slack of zero."""
         rows = self.row_offsets - torch.einsum("bmd,...bd->...bm", self.rows, action)
         cones = self.cone_sizes - vector_norm(self.white(action), dim=-1)
         sums = self.sum_sizes - self._terms(action).sum(-1)
-        slacks = torch.cat([rows, cones, sums], -1)
+        return torch.cat([rows, cones, sums], -1)
+
+    def _smallest(self, rooms: Tensor) -> Tensor:
+        """Return the smallest slack of those that rooms leave."""
         rates = torch.cat([self.row_rates, self.cone_rates, self.sum_rates], -1)
         weights = torch.cat([self.row_weights, self.cone_weights, self.sum_weights], -1)
         counts = (weights > 0) & (rates > 0)
-        return torch.where(counts, slacks / torch.where(counts, rates, 1.0), torch.inf).amin(-1)
+        return torch.where(counts, rooms / torch.where(counts, rates, 1.0), torch.inf).amin(-1)
 
     def start(self, action: Tensor, margin: Tensor) -> Point:
         """Return a strictly feasible point at an action, its slack a margin below the possible."""

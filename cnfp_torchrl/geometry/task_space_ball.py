@@ -68,8 +68,11 @@ class TaskSpaceBall(ConstraintSet):
         return self.gauge_about(centre)(direction)
 
     def gauge_about(self, centre: Tensor) -> Gauge:
-        offset = _image(self.jacobian, centre) + self.offset
-        return partial(_gauge, self.jacobian, ball_gauge_about(offset, self.radius))
+        # In units of J's norm: what vanishes does so beside it, not beside one.
+        norm = self._norm()
+        offset = (_image(self.jacobian, centre) + self.offset) / norm.unsqueeze(-1)
+        jacobian = self.jacobian / norm[..., None, None]
+        return partial(_gauge, jacobian, ball_gauge_about(offset, self.radius / norm))
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps

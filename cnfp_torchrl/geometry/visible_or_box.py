@@ -96,7 +96,11 @@ class VisibleOrBox(ConstraintSet):
 
     def superlevel(self) -> Rows:
         """Describe a convex part, see `VisibleRegion.superlevel`, or the box."""
-        parts = (self.region.superlevel(), self.box.superlevel())
+        return self.part_near(torch.zeros_like(self.position))
+
+    def part_near(self, point: Tensor) -> Rows:
+        """Describe a convex part, see `VisibleRegion.part_near`, or the box."""
+        parts = (self.region.part_near(point), self.box.superlevel())
         counts = (self.sees.unsqueeze(-1), ~self.sees.unsqueeze(-1))
         offsets = [
             torch.where(on, p.offsets, torch.inf) for p, on in zip(parts, counts, strict=True)

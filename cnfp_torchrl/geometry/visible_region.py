@@ -170,13 +170,37 @@ class VisibleRegion(ConstraintSet):
 
     def superlevel(self) -> Rows:
         """Describe a convex part: before each rectangle, the side that leaves the most room."""
+        return self.part_near(torch.zeros_like(self.position))
+
+    def part_near(self, point: Tensor) -> Rows:
+        """Describe the convex part with the largest slack at a point ``(*batch, d)``.
+
+        What a rectangle leaves is a union of half-spaces, the lines of `slack`: this side of it, or
+        past a corner of it on the side away from its shadow. One is taken for each rectangle.
+        """
         low, high = self._in_action_units()
-        gap, side = torch.cat([low, -high], -1).max(-1)
-        identity = torch.eye(self.dim, dtype=gap.dtype, device=gap.device)
-        normals = torch.cat([identity, -identity])[side]
-        # In a rectangle the part is empty: 0 a + t <= gap < 0.
-        normals = torch.where((gap > 0).unsqueeze(-1), normals, 0.0)
-        return Rows(normals, gap, torch.ones_like(gap))
+        identity = torch.eye(self.dim, dtype=low.dtype, device=low.device)
+        # Lines in tau: slope tau - normal . a, of which the largest at some tau >= 1 is the slack.
+        slope, normals = torch.cat([low, -high], -1), torch.cat([identity, -identity])
+        finite = slope.isfinite()
+        slope = torch.where(finite, slope, 0.0)
+        j, k = slope.unsqueeze(-1), slope.unsqueeze(-2)
+        pair = (finite & (slope > 0)).unsqueeze(-1) & (finite & (slope < 0)).unsqueeze(-2)
+        share = torch.where(pair, j / torch.where(pair, j - k, 1), 0.0).unsqueeze(-1)
+        crossing = share * normals + (1 - share) * normals.unsqueeze(-2)
+        # All half-spaces, normal . a + t <= offset.
+        normals = torch.cat([normals.expand(*slope.shape, -1), crossing.flatten(-3, -2)], -2)
+        offsets = torch.cat([slope, torch.zeros_like(pair.flatten(-2), dtype=slope.dtype)], -1)
+        valid = torch.cat([finite & (slope >= 0), pair.flatten(-2)], -1)
+        slack = offsets - (normals * point[..., None, None, :]).sum(-1)
+        best = torch.where(valid, slack, -torch.inf).argmax(-1, keepdim=True)
+        normal = normals.take_along_dim(best.unsqueeze(-1), -2).squeeze(-2)
+        offset = offsets.take_along_dim(best, -1).squeeze(-1)
+        # In a rectangle the part is empty: 0 a + t <= -1.
+        outside = valid.any(-1)
+        normal = torch.where(outside.unsqueeze(-1), normal, 0.0)
+        offset = torch.where(outside, offset, -1.0)
+        return Rows(normal, offset, torch.ones_like(offset))
 
     def _in_action_units(self) -> tuple[Tensor, Tensor]:
         """Return the rectangles' corners as seen from the position, each ``(*batch, m, d)``."""

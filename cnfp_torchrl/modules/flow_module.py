@@ -36,12 +36,18 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     `cnfp_torchrl.envs.ConstraintCentre` computes. Ends an actor, as TorchRL's own probabilistic
     modules do.
 
+    Sets are eroded by the rounding error of the action spec's dtype, in which actions are executed:
+    geometry that comes in float64, from the observations of Gymnasium's MuJoCo environments for
+    example, is rounded to it first, by less than that margin. Actions of a float64 Gaussian are of
+    float64, and remain allowed when an environment rounds them to a float32 spec.
+
     Args:
         spec: the bounded action spec; its bounds are stage 0 of the flow.
         bijectors: one `ConstraintBijector` for each constraint.
         order: the constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
-        flow: how the sets are combined: a `Flow`, or ``exact``, ``radial``, ``squash``, ``none``.
+        flow: how the sets are combined: a `Flow`, or ``exact``, ``gauge``, ``radial``, ``squash``,
+            ``projection``, ``none``.
         in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
         out_key: the action, ``(*batch, d)``.
         return_log_prob: also write the action's log-density, ``(*batch,)``.
@@ -80,6 +86,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             **kwargs,
         )
         bounds = action_bounds(spec, out_key)
+        self.action_dtype = bounds.dtype
         self.register_buffer("low", bounds.low, persistent=False)
         self.register_buffer("high", bounds.high, persistent=False)
         self._bijectors = nn.ModuleList(in_order(bijectors, order))
@@ -104,8 +111,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     @property
     def bounds(self) -> Box:
-        """The action bounds, stage 0."""
-        return Box(self.low, self.high, validate_args=False)
+        """The action bounds, stage 0, in the dtype of the action spec."""
+        return Box(self.low, self.high, validate_args=False).to(self.action_dtype)
 
     @property
     def action_key(self) -> NestedKey:
@@ -137,10 +144,11 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bounds = self.bounds
         if not self.flow.reads_constraints:
             return self.flow(bounds, [], None, None)
-        sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
+        sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
         if not self.flow.is_exact:
             return self.flow(bounds, sets, None, None)
-        return self.flow(bounds, sets, self._centre(tensordict), self._active(tensordict))
+        centre = self._centre(tensordict).to(self.action_dtype)
+        return self.flow(bounds, sets, centre, self._active(tensordict))
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
         """Return the region of allowed actions, for any flow; needs centre and active flags."""
@@ -150,11 +158,18 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
-        loc, scale = (tensordict.get(key) for key in self.parameter_keys)
+        loc, scale = (self.as_fine(tensordict.get(key)) for key in self.parameter_keys)
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
         return self.distribution_type(base, self.get_bijector(tensordict))
 
     build_dist_from_params = get_dist
+
+    def as_fine(self, value: Tensor) -> Tensor:
+        """Return a latent or its parameter, in the action spec's dtype if its own is coarser."""
+        if value.dtype == torch.float32:
+            return value.to(self.action_dtype)
+        # Half precision stays, to be refused.
+        return value
 
     def random(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act on standard Gaussian noise, whatever the network says; writes that Gaussian too.

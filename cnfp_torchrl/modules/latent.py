@@ -27,7 +27,7 @@ from torchrl.modules import (
 )
 
 from cnfp_torchrl.distributions import ConstrainedFlow
-from cnfp_torchrl.modules.actors import _parts, flow_head
+from cnfp_torchrl.modules.actors import actor_modules, flow_head
 from cnfp_torchrl.modules.constraint_bijector import require
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 
@@ -67,7 +67,8 @@ class FlowMap(TensorDictModuleBase):
                 f"key {self.latent_key!r}: expected latents of {self.head.low.shape[-1]} "
                 f"components, as the action has, given shape {tuple(latent.shape)}"
             )
-        return tensordict.set(self.head.action_key, self.head.get_bijector(tensordict)(latent))
+        bijector = self.head.get_bijector(tensordict)
+        return tensordict.set(self.head.action_key, bijector(self.head.as_fine(latent)))
 
 
 class LatentGaussian(IndependentNormal):
@@ -163,7 +164,7 @@ def split_at_latent(
         TypeError: when the actor does not end in a `ConstrainedFlowModule`.
     """
     head = flow_head(actor)
-    body = _parts(actor)[:-1]
+    body = actor_modules(actor)[:-1]
     options: dict[str, Any] = {
         "in_keys": list(head.parameter_keys),
         "out_keys": [latent_key],

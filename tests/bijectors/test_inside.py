@@ -5,13 +5,14 @@ Judged on the exact numbers by `reference.contains`, which shares no code with t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 import torch
 
 from cnfp_torchrl.bijectors import (
+    AlignedSquash,
     Bijector,
     BijectorChain,
     BoxSquash,
@@ -74,7 +75,13 @@ FAMILIES: tuple[Family, ...] = (
 
 def violations(build: Build, make: Maker, families: tuple[Family, ...], lengths: tuple) -> int:
     """Count float32 actions outside random regions, one latent of each length for each region."""
-    sets = (make.bounds(), *(family(make) for family in families))
+    return violations_of(build, make, [family(make) for family in families], lengths)
+
+
+def violations_of(
+    build: Build, make: Maker, constraints: Sequence[ConstraintSet], lengths: tuple
+) -> int:
+    sets = (make.bounds(), *constraints)
     single = tuple(cast(each, torch.float32) for each in sets)
     bijector = build(Region(single, make.centre.float()))
     case = Case("", "gauge", sets, make.centre)
@@ -98,6 +105,23 @@ def test_random_regions_are_never_left(build: Build, dim: int, slack: float) -> 
             chosen = torch.randperm(len(FAMILIES), generator=make.random)[: 1 + 2 * number]
             families = tuple(FAMILIES[i] for i in chosen)
             assert violations(build, make, families, LENGTHS[1:]) == 0
+
+
+@pytest.mark.parametrize("build", [AlignedSquash, GaugeSquash, RadialSquash])
+@pytest.mark.parametrize("dim", [1, 2, 6, 32])
+def test_rounding_sets_to_float32_stays_within_their_margin(build: Build, dim: int) -> None:
+    """Sets of float64 numbers that float32 does not hold, as observations of float64 make them."""
+    for family in (*FAMILIES, Maker.task_space_ball):
+        for size in (1e-3, 1.0, 1e3):
+            make = Maker(dim, (500,), size=size, slack=1e-3, offset=2.0, seed=dim)
+
+            def unrounded(field: torch.Tensor, _: int, make: Maker = make) -> torch.Tensor:
+                change = torch.rand(field.shape, generator=make.random, dtype=torch.float64)
+                return field * (1 + 5e-8 * (2 * change - 1))
+
+            exact = family(make).with_fields(unrounded)
+            assert not (exact.to(torch.float32).to(torch.float64).slack(make.centre) < 0).any()
+            assert violations_of(build, make, [exact], (1.0, 20.0, 1e6)) == 0
 
 
 def retraction(region: Region) -> Bijector:

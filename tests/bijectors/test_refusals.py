@@ -48,6 +48,10 @@ REFUSED = {
         lambda: BoxSquash(-ONE, ONE.double()),
         "expected one dtype for all fields, given",
     ),
+    "region of two precisions": (
+        lambda: GaugeSquash(Region((BOX, Ball(ZERO.double(), ONE[0].double())), ZERO)),
+        "sets and centre: expected one dtype, given [torch.float32, torch.float64] and torch.float",
+    ),
     "scalar bounds": (
         lambda: BoxSquash(torch.tensor(-1.0), torch.tensor(1.0)),
         "field 'low': expected at least 1 dimensions (*batch, ...), given shape ()",

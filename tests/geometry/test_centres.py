@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cnfp_torchrl.bijectors import AlignedSquash
 from cnfp_torchrl.geometry import (
     MINIMUM_SLACK,
     Ball,
@@ -20,13 +21,15 @@ from cnfp_torchrl.geometry import (
     HalfSpaces,
     PositivePart,
     Region,
+    Rows,
+    TaskSpaceBall,
     VisibleRegion,
     WeightedL1Ball,
     centres,
     chebyshev_centre,
     lexicographic_centre,
 )
-from tests.geometry.cases import DTYPES
+from tests.geometry.cases import CASES, DTYPES, Case
 
 BOUNDS = Box(-torch.ones(2).double(), torch.ones(2).double())
 
@@ -335,6 +338,64 @@ def test_the_visible_region_among_other_sets() -> None:
             assert active[:, index].tolist() == [True, True, False, True]
             assert active[:, 3 - index].all()
             check(sets, centre, active)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("distance", [1e3, 1e6, 1e9, 1e12])
+def test_sets_far_beyond_the_bounds_are_dropped(distance: float, dtype: torch.dtype) -> None:
+    """As good as at infinity: how some say that nothing is allowed. In one batch with others."""
+    angles = torch.arange(8, dtype=torch.float64)
+    way = torch.stack([angles.cos(), angles.sin()], -1)
+    center = torch.cat([distance * way, t([0.3, 0.2])])
+    radius = t(0.5).expand(9)
+    identity = torch.eye(2).double()
+    far = (
+        Ball(center, radius),
+        Ellipsoid(center, (radius[:, None, None] * identity)),
+        TaskSpaceBall(identity.expand(9, 2, 2), -center, radius),
+    )
+    for each in far:
+        sets = [each.to(dtype) for each in (BOUNDS, each)]
+        centre, active = lexicographic_centre(sets)
+        assert centre.isfinite().all()
+        assert BOUNDS.contains(centre).all()
+        assert active[..., 1].tolist() == [False] * 8 + [True]
+        action = AlignedSquash(Region(tuple(sets), centre, active))(torch.randn(50, 9, 2).to(dtype))
+        assert BOUNDS.contains(action).all()
+
+
+@pytest.mark.parametrize("center", [(0.7, 0.7), (0.5, 0.5), (0.9, -0.9), (0.3, 0.6), (0.9, 0.5)])
+@pytest.mark.parametrize("visible_last", [False, True])
+def test_what_lies_beside_a_shadow_is_visible(
+    center: tuple[float, float], visible_last: bool
+) -> None:
+    """The side of the rectangle that faces the agent leaves all of these balls out."""
+    rectangle = t([[0.3, -0.2], [0.6, 0.1]])
+    visible = VisibleRegion(t(0.0, 0.0), rectangle, t(1.0)[0])
+    ball = Ball(t(*center), t(0.15)[0])
+    sets = [BOUNDS, ball, visible] if visible_last else [BOUNDS, visible, ball]
+    centre, active = lexicographic_centre(sets)
+    assert active.all()
+    assert min(each.slack(centre) for each in sets) >= MINIMUM_SLACK
+    hidden = Ball(t(0.8, -0.05), t(0.1)[0])
+    _, active = lexicographic_centre([BOUNDS, hidden, visible])
+    assert active.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if not c.convex], ids=lambda case: case.name)
+def test_parts_near_a_point_lie_in_the_set_and_have_its_slack_there(case: Case) -> None:
+    torch.manual_seed(0)
+    points = 3 * case.size * torch.randn(200, *case.inside.shape, dtype=torch.float64)
+    for point in points[:20]:
+        part = case.sets.part_near(point)
+        assert isinstance(part, Rows)
+
+        def slack(action: Tensor, part: Rows = part) -> Tensor:
+            rooms = part.offsets - (part.normals * action.unsqueeze(-2)).sum(-1)
+            return (rooms / part.rates).amin(-1)
+
+        torch.testing.assert_close(slack(point), case.sets.slack(point), rtol=1e-9, atol=1e-12)
+        assert (slack(points) <= case.sets.slack(points) + 1e-9 * case.size).all()
 
 
 def test_bounds_are_asked_for() -> None:

@@ -62,3 +62,14 @@ def test_a_jacobian_of_zero_allows_all_or_nothing(offset: float, holds: bool) ->
     centre, active = lexicographic_centre([Box(-ones, ones), ball])
     assert active.tolist() == [True, holds]
     assert (ball.gauge(actions, centre) == 0).all()
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-20, 1e-10, 1.0, 1e10, 1e25])
+def test_the_unit_of_the_image_does_not_matter(unit: float) -> None:
+    jacobian, offset = torch.tensor([[1.0, 0.5]]), torch.tensor([0.1])
+    here = TaskSpaceBall(jacobian, offset, torch.tensor(0.2))
+    there = TaskSpaceBall(unit * jacobian, unit * offset, torch.tensor(0.2 * unit))
+    way = torch.randn(100, 2)
+    for centre in (torch.zeros(2), torch.tensor([0.05, -0.1])):
+        torch.testing.assert_close(there.gauge(way, centre), here.gauge(way, centre))
+        torch.testing.assert_close(there.slack(centre + way), here.slack(centre + way))

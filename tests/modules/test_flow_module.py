@@ -394,6 +394,24 @@ def test_float64_actions_on_float32_geometry_survive_the_cast(
         assert held.all(), name
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("flow", SAFE_FLOWS)
+def test_actions_on_float64_geometry_are_allowed(
+    make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str, dtype: torch.dtype
+) -> None:
+    """Observations of float64, as Gymnasium's MuJoCo environments give, under a float32 spec."""
+    actor = make_actor(LATENTS["saturated"], flow=flow)
+    many = doubled(state).expand(500, *state.shape).clone()
+    many["observation"] = many["observation"].to(dtype)
+    for value in many["constraints"].values(include_nested=True, leaves_only=True):
+        if value.is_floating_point():
+            value.mul_(1 + 5e-8 * torch.rand_like(value))
+    assert actor(many)["action"].dtype == dtype
+    assert all(held.all() for held in inside(many).values())
+    many["action"] = many["action"].float()
+    assert all(held.all() for held in inside(many).values())
+
+
 def test_moving_to_a_device_takes_the_bounds_along(make_actor: MakeActor) -> None:
     actor = make_actor().to("meta")
     assert {tensor.device.type for tensor in flow_head(actor).buffers()} == {"meta"}
