@@ -1,5 +1,6 @@
 """Environments and the transforms that publish their constraints into the tensordict."""
 
+from cnfp_torchrl.envs.action_guard import ActionGuard
 from cnfp_torchrl.envs.centre import ConstraintCentre, constrain_env, constraint_bijectors
 from cnfp_torchrl.envs.cost import ConstraintCost, constraint_names
 from cnfp_torchrl.envs.dynamics import PointNavDynamics, State, Transition
@@ -17,6 +18,7 @@ register()
 
 __all__ = [
     "POINT_NAV_ID",
+    "ActionGuard",
     "BatteryGeometry",
     "ConstraintCentre",
     "ConstraintCost",

@@ -20,15 +20,37 @@ from cnfp_torchrl.geometry.centres import lexicographic_centre
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
 from cnfp_torchrl.modules.flow_module import action_bounds
 
+_EXAMPLE = "write constrain_env(env, BatteryGeometry(), ObstacleGeometry())"
 
-def constraint_bijectors(env: TransformedEnv) -> list[ConstraintBijector]:
-    """Return a bijector for each constraint whose geometry the environment publishes."""
-    state = env.observation_spec.zero()
-    return [
-        ConstraintBijector(transform.name, type(transform.constraint_set(state)))
-        for transform in appended_transforms(env)
-        if isinstance(transform, GeometryTransform)
-    ]
+
+def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
+    """Return a bijector for each constraint that the environment publishes.
+
+    They come in order of application: that of the environment's `ConstraintCentre`, or without one
+    that of its geometry transforms.
+
+    Args:
+        env: such as `constrain_env` returns; one environment, no batch of environments in workers.
+
+    Raises:
+        ValueError: when it publishes no constraint, or one that its `ConstraintCentre` leaves out.
+    """
+    centres = [each for each in appended_transforms(env) if isinstance(each, ConstraintCentre)]
+    bijectors = centres[-1].bijectors if centres else _published(env)
+    if not bijectors:
+        raise ValueError(
+            f"env: expected one that publishes at least one constraint, given "
+            f"{type(env).__name__} without a GeometryTransform of its own; make it with "
+            "constrain_env, and before batching: the transforms in the workers of a SerialEnv or "
+            "ParallelEnv are out of reach, so call this on one of the environments it is made of"
+        )
+    known = {bijector.name for bijector in bijectors}
+    if left_out := [each.name for each in _geometries(env) if each.name not in known]:
+        raise ValueError(
+            f"env: expected its ConstraintCentre to know all constraints, given one with "
+            f"{sorted(known)} that leaves out {left_out}; pass all geometries to one constrain_env"
+        )
+    return bijectors
 
 
 def constrain_env(
@@ -43,14 +65,32 @@ def constrain_env(
         env: with a bounded action spec; not changed.
         geometries: one transform for each constraint.
         order: the constraints' names in order of application, the last with the highest priority;
-            None takes the order of the geometries. The same as the actor's.
+            None takes the order of the geometries. ``constraint_bijectors(env)`` keeps it.
 
     Raises:
-        ValueError: when an order does not name each constraint exactly once.
+        TypeError: when a geometry is none, such as a class or a list, or the order is a string.
+        ValueError: without geometries, or when an order does not name each constraint once.
     """
+    if not geometries:
+        raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
+    for each in geometries:
+        if not isinstance(each, GeometryTransform):
+            kind = f"the class {each.__name__}" if isinstance(each, type) else type(each).__name__
+            raise TypeError(
+                f"geometries: expected each to be a GeometryTransform, given {kind}; {_EXAMPLE}"
+            )
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
-    bijectors = constraint_bijectors(published)
-    return published.append_transform(ConstraintCentre(bijectors, order))
+    return published.append_transform(ConstraintCentre(_published(published), order))
+
+
+def _published(env: EnvBase) -> list[ConstraintBijector]:
+    geometries = _geometries(env)
+    state = env.observation_spec.zero() if geometries else None
+    return [ConstraintBijector(each.name, type(each.checked_set(state))) for each in geometries]
+
+
+def _geometries(env: EnvBase) -> list[GeometryTransform]:
+    return [each for each in appended_transforms(env) if isinstance(each, GeometryTransform)]
 
 
 class ConstraintCentre(Transform):
@@ -71,6 +111,7 @@ class ConstraintCentre(Transform):
             None takes the bijectors' own order. The same as the flow's.
 
     Raises:
+        TypeError: when a bijector is none, or the order is a string.
         ValueError: when an order does not name each constraint exactly once.
     """
 
@@ -86,9 +127,15 @@ class ConstraintCentre(Transform):
         self.register_buffer("_low", None, persistent=False)
         self.register_buffer("_high", None, persistent=False)
 
+    @property
+    def bijectors(self) -> list[ConstraintBijector]:
+        """One for each constraint, in order of application."""
+        return list(self._bijectors)
+
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         bounds = self._action_bounds()
-        sets = [bijector.get_set(next_tensordict) for bijector in self._bijectors]
+        # In the dtype of the actions, as the flow will see them.
+        sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
         for bijector, each in zip(self._bijectors, sets, strict=True):
             if each.dim != bounds.dim:
                 raise GeometryError(
@@ -96,6 +143,8 @@ class ConstraintCentre(Transform):
                     f"components, as the action spec has, given one with {each.dim}"
                 )
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
+        if candidate is not None:
+            candidate = candidate.to(bounds.dtype)
         centre, active = lexicographic_centre([bounds, *sets], candidate)
         batch = next_tensordict.batch_size
         next_tensordict.set(CENTRE_KEY, centre.expand(*batch, centre.shape[-1]))

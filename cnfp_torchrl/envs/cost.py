@@ -31,13 +31,14 @@ class ConstraintCost(Transform):
             before and after the step. None: the environment publishes ``cost`` itself.
 
     Raises:
+        TypeError: for indicators that are no mapping of names to functions.
         ValueError: for an indicator of the wrong shape or dtype, and where the environment's cost
             is missing or not float32 ``(*batch, K)``.
     """
 
     def __init__(self, indicators: Mapping[str, Indicator] | None = None) -> None:
-        if indicators is not None and not indicators:
-            raise ValueError("indicators: expected at least one, or None, given an empty mapping")
+        if indicators is not None:
+            _refuse_what_is_no_indicator(indicators)
         super().__init__(in_keys=[COST_KEY], out_keys=[COST_KEY, EPISODE_COST_KEY])
         self.indicators = None if indicators is None else dict(indicators)
 
@@ -126,6 +127,22 @@ class ConstraintCost(Transform):
         if self.indicators is not None:
             tensordict_reset.set(COST_KEY, zero.clone())
         return tensordict_reset.set(EPISODE_COST_KEY, zero)
+
+
+def _refuse_what_is_no_indicator(indicators: Mapping[str, Indicator]) -> None:
+    if not isinstance(indicators, Mapping):
+        raise TypeError(
+            "indicators: expected a mapping of constraint names to functions, given "
+            f"{type(indicators).__name__}; write ConstraintCost({{NAME: indicator}})"
+        )
+    if not indicators:
+        raise ValueError("indicators: expected at least one, or None, given an empty mapping")
+    for name, indicator in indicators.items():
+        if not callable(indicator):
+            raise TypeError(
+                f"indicator '{name}': expected a function of the tensordicts before and after the "
+                f"step, given {indicator!r}"
+            )
 
 
 def constraint_names(env: EnvBase) -> tuple[str, ...]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from cnfp_torchrl.geometry import ConstraintSet, GeometryError
+from cnfp_torchrl.modules.constraint_bijector import refuse_string
 
 CONSTRAINTS_KEY = "constraints"
 """Where geometry stands in the tensordict: ``("constraints", NAME, FIELD)``."""
@@ -40,6 +44,7 @@ class GeometryTransform(Transform, ABC):
     Everything is checked here, eagerly, once a step, so that nothing has to be checked later in
     compiled code. A set must be valid in every state, also where no action keeps the constraint:
     publish one that misses the action bounds there; the flow drops it in that state and says so.
+    All states' sets are of one family.
 
     Args:
         name: the constraint's name, by which flow and order refer to it.
@@ -47,9 +52,13 @@ class GeometryTransform(Transform, ABC):
 
     Raises:
         ValueError: for a bad or reserved name.
-        GeometryError: for input that is not finite, and for a set that is not one, naming key or
-            constraint and field, and the batch index.
+        TypeError: for `in_keys` that are a string, and where `constraint_set` returns no set.
+        GeometryError: for input that is not finite, for a set that is not one, for a second family
+            and for a family that breaks the contract of `ConstraintSet`, naming key or constraint
+            and field, and the batch index.
     """
+
+    _family: type[ConstraintSet] | None = None
 
     def __init__(self, name: str, in_keys: Sequence[NestedKey] = ("observation",)) -> None:
         if not isinstance(name, str) or not name or name in _RESERVED_NAMES:
@@ -57,6 +66,7 @@ class GeometryTransform(Transform, ABC):
                 f"name: expected a constraint's name other than {list(_RESERVED_NAMES)}, "
                 f"given {name!r}"
             )
+        refuse_string("in_keys", in_keys)
         super().__init__(in_keys=list(in_keys), out_keys=[(CONSTRAINTS_KEY, name)])
         self.name = name
 
@@ -85,6 +95,22 @@ class GeometryTransform(Transform, ABC):
         """
         return None
 
+    def checked_set(self, tensordict: TensorDictBase) -> ConstraintSet:
+        """Return `constraint_set` of some states, if it is a set of the same family as before.
+
+        The values are not looked at.
+
+        Raises:
+            TypeError: when it is no `ConstraintSet`.
+            GeometryError: for another family than before, and one that breaks the contract.
+        """
+        with self._naming_the_constraint("constraint_set"):
+            allowed = self.constraint_set(tensordict)
+        if type(allowed) is not self._family:
+            self._refuse_what_is_no_set(allowed)
+            self._family = type(allowed)
+        return allowed
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         published = set(observation_spec.keys(include_nested=True, leaves_only=True))
         if missing := [key for key in self.in_keys if key not in published]:
@@ -92,7 +118,10 @@ class GeometryTransform(Transform, ABC):
                 f"constraint '{self.name}': expected to read {missing}, "
                 f"given an environment with {sorted(map(str, published))}"
             )
-        entries = self._entries(observation_spec.zero())
+        state = observation_spec.zero()
+        allowed = self.checked_set(state)
+        entries = self._entries(state, allowed)
+        self._refuse_slack_of_wrong_shape(allowed, state.batch_size)
         for key, value in entries.items():
             if key in published:
                 raise ValueError(
@@ -112,7 +141,8 @@ class GeometryTransform(Transform, ABC):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.in_keys:
             self._refuse_what_is_not_finite(key, next_tensordict.get(key))
-        for key, value in self._entries(next_tensordict, validate=True).items():
+        allowed = self.checked_set(next_tensordict).validate(self.name)
+        for key, value in self._entries(next_tensordict, allowed).items():
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -122,11 +152,8 @@ class GeometryTransform(Transform, ABC):
         return self._call(tensordict_reset)
 
     def _entries(
-        self, tensordict: TensorDictBase, *, validate: bool = False
+        self, tensordict: TensorDictBase, allowed: ConstraintSet
     ) -> dict[tuple[str, ...], Tensor]:
-        allowed = self.constraint_set(tensordict)
-        if validate:
-            allowed.validate(self.name)
         batch = tensordict.batch_size
         entries: dict[tuple[str, ...], Tensor] = {}
         for field, value in allowed.fields().items():
@@ -139,10 +166,59 @@ class GeometryTransform(Transform, ABC):
                     f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
                 ) from None
             entries[CONSTRAINTS_KEY, self.name, field] = expanded
-        action = self.safe_action(tensordict, allowed)
+        with self._naming_the_constraint("safe_action"):
+            action = self.safe_action(tensordict, allowed)
         if action is not None:
+            expected = (*batch, allowed.dim)
+            _refuse_other_shape(f"{self._at('safe_action')}: expected None or", action, expected)
             entries[SAFE_ACTION_KEY] = action
         return entries
+
+    def _at(self, method: str) -> str:
+        return f"constraint '{self.name}', {type(self).__name__}.{method}"
+
+    @contextmanager
+    def _naming_the_constraint(self, method: str) -> Iterator[None]:
+        """Add to errors of a constraint's own code which constraint and method it is."""
+        try:
+            yield
+        except AttributeError as error:
+            # As it is, an environment would take it for a missing spec and say no more than that.
+            raise GeometryError(f"{self._at(method)}: AttributeError: {error}") from error
+        except Exception as error:
+            error.add_note(f"raised by {self._at(method)}")
+            raise
+
+    def _refuse_what_is_no_set(self, allowed: ConstraintSet) -> None:
+        family = type(allowed)
+        if not isinstance(allowed, ConstraintSet):
+            raise TypeError(
+                f"{self._at('constraint_set')}: expected it to return a ConstraintSet such as "
+                f"cnfp_torchrl.geometry.Ball, given {family.__name__}"
+            )
+        where = f"constraint '{self.name}' ({family.__name__})"
+        if self._family is not None:
+            raise GeometryError(
+                f"{where}: expected a {self._family.__name__}, as in the states before, given a "
+                f"{family.__name__}; return sets of one family in all states"
+            )
+        fields = [field.name for field in dataclasses.fields(allowed)]
+        event_dims = getattr(family, "event_dims", {})
+        if set(event_dims) != set(fields) or not any(event_dims.values()):
+            raise GeometryError(
+                f"{where}: expected event_dims with the number of event dimensions of each field, "
+                f"{fields}, at least one of them with the actions' d, given {event_dims}; see "
+                "ConstraintSet, and decorate the family with @dataclass(frozen=True, eq=False)"
+            )
+        allowed.validate_shapes(where)
+
+    def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
+        zeros = next(iter(allowed.fields().values())).new_zeros(*batch, allowed.dim)
+        method = f"constraint_set, {type(allowed).__name__}.slack"
+        with self._naming_the_constraint(method):
+            slack = allowed.slack(zeros)
+        given = f"for actions {tuple(zeros.shape)} expected"
+        _refuse_other_shape(f"{self._at(method)}: {given}", slack, batch)
 
     def _refuse_what_is_not_finite(self, key: NestedKey, value: Tensor) -> None:
         finite = value.isfinite()
@@ -154,9 +230,23 @@ class GeometryTransform(Transform, ABC):
             )
 
 
+def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> None:
+    if not isinstance(given, Tensor) or given.shape != torch.Size(shape):
+        what = tuple(given.shape) if isinstance(given, Tensor) else type(given).__name__
+        raise GeometryError(f"{expected} a tensor of shape {tuple(shape)}, given {what}")
+
+
 def appended_transforms(env: EnvBase) -> list[Transform]:
-    """Return the transforms of an environment in order, none if it has none."""
-    transform = getattr(env, "transform", None)
-    if transform is None:
+    """Return the transforms of an environment in order, none if it has none.
+
+    Those in the workers of a batched environment are not among them.
+    """
+    if not isinstance(env, TransformedEnv):
         return []
-    return list(transform) if isinstance(transform, Compose) else [transform]
+    return [*appended_transforms(env.base_env), *_flat(env.transform)]
+
+
+def _flat(transform: Transform) -> list[Transform]:
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [part for each in transform for part in _flat(each)]

@@ -224,14 +224,22 @@ class ConstraintSet(ABC):
         """
         kind = type(self).__name__
         where = f"constraint '{name}' ({kind})" if name else kind
-        self._validate_shapes(where)
+        self.validate_shapes(where)
         for field, value in self.fields().items():
             self._refuse(where, field, torch.isnan(value), "a number")
         for field, bad, expected in self.violations():
             self._refuse(where, field, bad, expected)
         return self
 
-    def _validate_shapes(self, where: str) -> None:
+    def validate_shapes(self, where: str) -> None:
+        """Refuse fields of wrong types or shapes, without a look at their values.
+
+        Args:
+            where: what the message begins with.
+
+        Raises:
+            GeometryError: naming the field, the expected and the given.
+        """
         dtypes = {name: getattr(value, "dtype", None) for name, value in self.fields().items()}
         for name, value in self.fields().items():
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):

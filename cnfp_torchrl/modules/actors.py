@@ -17,7 +17,7 @@ from torchrl.modules import (
 )
 
 from cnfp_torchrl.geometry import Box
-from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, refuse_string
 from cnfp_torchrl.modules.flow_module import (
     ConstrainedFlowModule,
     ReferenceEntropyFlowModule,
@@ -47,7 +47,12 @@ def make_constrained_actor(
         order: see `ConstrainedFlowModule`.
         flow: see `ConstrainedFlowModule`.
         return_log_prob: also write ``action_log_prob``.
+
+    Raises:
+        TypeError: when `in_keys` or `order` is a string, or a bijector is none.
+        ValueError: see `ConstrainedFlowModule`.
     """
+    refuse_string("in_keys", in_keys)
     parameters = TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"])
     head = ConstrainedFlowModule(
         spec, bijectors, order=order, flow=flow, return_log_prob=return_log_prob
@@ -73,18 +78,20 @@ def constrain(
     Args:
         actor: a `torchrl.modules.ProbabilisticActor` or another sequence that ends in a
             probabilistic module.
-        bijectors: one for each constraint, in order of application unless `order` is given.
+        bijectors: one for each constraint, in order of application unless `order` is given; none
+            only where the actor is constrained already, to change its flow or order.
         flow: see `ConstrainedFlowModule`.
         order: see `ConstrainedFlowModule`.
         spec: the bounded action spec; None takes the actor's own.
 
     Raises:
-        TypeError: when the actor does not end in a distribution that can be a base.
+        TypeError: when the actor does not end in a distribution that can be a base, when a bijector
+            is none, or when the order is a string.
         ValueError: when bounds are missing or are not those of the TanhNormal, when the
-            distribution is more than a Gaussian of location and scale, or when an order does not
-            name each constraint once.
+            distribution is more than a Gaussian of location and scale, when an order does not
+            name each constraint once, or when there would be no constraint.
     """
-    *body, head = _parts(actor)
+    *body, head = actor_modules(actor)
     parameter_keys = _parameter_keys(head)
     action_key = head.dist_sample_keys[0]
     spec = getattr(head, "spec", None) if spec is None else spec
@@ -94,7 +101,13 @@ def constrain(
             "constrain(..., spec=env.action_spec_unbatched)"
         )
     _refuse_other_bounds(head, action_bounds(spec, action_key))
-    before = head.bijectors if isinstance(head, ConstrainedFlowModule) else []
+    is_constrained = isinstance(head, ConstrainedFlowModule)
+    if not bijectors and not is_constrained:
+        raise ValueError(
+            "bijectors: expected at least one for an actor that is not constrained yet, given "
+            "none; pass constrain(actor, *constraint_bijectors(env))"
+        )
+    before = head.bijectors if is_constrained else []
     constrained = ConstrainedFlowModule(
         spec,
         [*before, *bijectors],
@@ -126,7 +139,7 @@ def with_reference_entropy(
         out_key=head.action_key,
         **_other_options(head),
     )
-    return SafeProbabilisticTensorDictSequential(*_parts(actor)[:-1], view)
+    return SafeProbabilisticTensorDictSequential(*actor_modules(actor)[:-1], view)
 
 
 def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule:
@@ -135,7 +148,7 @@ def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule
     Raises:
         TypeError: when the actor is not a constrained one.
     """
-    head = _parts(actor)[-1]
+    head = actor_modules(actor)[-1]
     if not isinstance(head, ConstrainedFlowModule):
         raise TypeError(
             f"actor: expected one that ends in a ConstrainedFlowModule, given {type(head).__name__}"
@@ -146,12 +159,16 @@ def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule
 
 def has_density(actor: ProbabilisticTensorDictSequential) -> bool:
     """Tell whether an actor's actions have a log-density, which projected ones have not."""
-    head = _parts(actor)[-1]
+    head = actor_modules(actor)[-1]
     return head.flow.has_density if isinstance(head, ConstrainedFlowModule) else True
 
 
-def _parts(actor: ProbabilisticTensorDictSequential) -> list[Any]:
-    """Return the modules of an actor."""
+def actor_modules(actor: ProbabilisticTensorDictSequential) -> list[Any]:
+    """Return the modules of an actor in order; the last one draws the action.
+
+    Raises:
+        TypeError: when the actor is no sequence that ends in a probabilistic module.
+    """
     if not isinstance(actor, ProbabilisticTensorDictSequential):
         raise TypeError(
             "actor: expected a sequence that ends in a probabilistic module, such as a "

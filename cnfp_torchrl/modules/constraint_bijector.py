@@ -36,6 +36,19 @@ def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
     return value
 
 
+def refuse_string(argument: str, given: object) -> None:
+    """Refuse a string where a sequence of names is expected: it would be taken for its letters.
+
+    Raises:
+        TypeError: naming the argument and what to write instead.
+    """
+    if isinstance(given, str):
+        raise TypeError(
+            f"{argument}: expected a sequence of names, given the string {given!r}; write "
+            f"{argument}=[{given!r}]"
+        )
+
+
 class ConstraintBijector(TensorDictModuleBase):
     """Read the geometry of one constraint from a tensordict and turn it into a bijector.
 
@@ -122,8 +135,16 @@ def in_order(
         order: names of the constraints in order of application; None takes the bijectors' own.
 
     Raises:
+        TypeError: when a bijector is none, or the order is a string.
         ValueError: when a name is unknown, missing or repeated.
     """
+    for each in bijectors:
+        if not isinstance(each, ConstraintBijector):
+            raise TypeError(
+                f"bijectors: expected each to be a ConstraintBijector, given {type(each).__name__};"
+                " unpack a list of them: constrain(actor, *constraint_bijectors(env))"
+            )
+    refuse_string("order", order)
     names = [bijector.name for bijector in bijectors]
     wanted = list(names if order is None else order)
     if sorted(wanted) != sorted(set(names)) or len(names) != len(set(names)):

@@ -7,7 +7,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.modules.actors import flow_head
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 
 
 class SafeRandomPolicy(TensorDictModuleBase):
@@ -17,12 +16,15 @@ class SafeRandomPolicy(TensorDictModuleBase):
     the flow module writes, and location 0 and scale 1 where a network would write its own.
 
     Args:
-        head: the flow module of a constrained actor.
+        actor: a constrained one; its networks are not asked.
+
+    Raises:
+        TypeError: when the actor is not a constrained one.
     """
 
-    def __init__(self, head: ConstrainedFlowModule) -> None:
+    def __init__(self, actor: SafeProbabilisticTensorDictSequential) -> None:
         super().__init__()
-        self.head = head
+        self.head = head = flow_head(actor)
         self.in_keys = head.geometry_keys()
         self.out_keys = [*head.parameter_keys, *head.out_keys]
 
@@ -48,7 +50,7 @@ class WarmUpPolicy(TensorDictModuleBase):
         if frames < 0:
             raise ValueError(f"frames: expected a number >= 0, given {frames}")
         self.actor = actor
-        self.random = SafeRandomPolicy(flow_head(actor))
+        self.random = SafeRandomPolicy(actor)
         self.frames_left = frames
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
 

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from cnfp_torchrl.envs import Layout
 from cnfp_torchrl.envs.layout import BATTERY_FULL
 from cnfp_torchrl.geometry import Region
-from cnfp_torchrl.modules import ConstrainedFlowModule, SafeRandomPolicy
+from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.visual.arena import layout_of
 
 _DIRECTIONS = 256
@@ -45,7 +45,7 @@ def telling_states(
     """
     layout = layout_of(env)
     if layout is None:
-        walk = env.rollout(steps, SafeRandomPolicy(head), break_when_any_done=False).reshape(-1)
+        walk = env.rollout(steps, head.random, break_when_any_done=False).reshape(-1)
         full = low = walk
     else:
         full, low = _point_nav_states(env, layout)

@@ -12,7 +12,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    GymEnv,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    check_env_specs,
+)
+from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.envs import (
     POINT_NAV_ID,
@@ -65,9 +74,8 @@ def flags(state: TensorDictBase) -> dict[str, Tensor]:
 
 def safe_random_policy(env: TransformedEnv) -> SafeRandomPolicy:
     bijectors = constraint_bijectors(env)
-    return SafeRandomPolicy(
-        ConstrainedFlowModule(env.action_spec_unbatched, bijectors, order=ORDER)
-    )
+    head = ConstrainedFlowModule(env.action_spec_unbatched, bijectors, order=ORDER)
+    return SafeRandomPolicy(SafeProbabilisticTensorDictSequential(head))
 
 
 # Specs --------------------------------------------------------------------------------------------
@@ -349,16 +357,69 @@ def test_bijectors_are_those_of_the_geometries() -> None:
     env.append_transform(RewardSum())
     bijectors = constraint_bijectors(env)
     assert [(each.name, each.set_type) for each in bijectors] == [
-        ("obstacle", Box),
         ("battery", Ball),
+        ("obstacle", Box),
     ]
+
+
+def names(env: EnvBase) -> list[str]:
+    return [bijector.name for bijector in constraint_bijectors(env)]
+
+
+@pytest.mark.parametrize(
+    "order", list(itertools.permutations(["left", "right", "up"])), ids="-".join
+)
+def test_bijectors_are_in_the_order_of_the_centre(order: tuple[str, ...]) -> None:
+    sides = [Side("left", -1.0, -0.25), Side("right", 0.25, 1.0), Forward("up")]
+    assert names(constrain_env(PointNavEnv([2]), *sides, order=order)) == list(order)
+
+
+def test_without_a_centre_they_are_in_the_order_of_the_geometries() -> None:
+    env = TransformedEnv(PointNavEnv([2]), Compose(ObstacleGeometry(), BatteryGeometry()))
+    assert names(env) == ["obstacle", "battery"]
+
+
+def test_geometries_are_found_however_deep_they_lie() -> None:
+    nested = Compose(Compose(ObstacleGeometry()), BatteryGeometry())
+    env = TransformedEnv(TransformedEnv(PointNavEnv([2]), nested), RewardSum(), auto_unwrap=False)
+    assert names(env) == ["obstacle", "battery"]
+
+
+def test_the_last_of_two_centres_counts() -> None:
+    once = constrain_env(PointNavEnv([2]), BatteryGeometry())
+    assert names(constrain_env(once, ObstacleGeometry())) == ["battery", "obstacle"]
+
+
+def test_an_environment_without_constraints_has_no_bijectors() -> None:
+    without = TransformedEnv(PointNavEnv([2]), RewardSum())
+    for env in (without, PointNavEnv([2])):
+        message = f"at least one constraint, given {type(env).__name__} without a GeometryTransform"
+        with pytest.raises(ValueError, match=message):
+            constraint_bijectors(env)
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_nor_has_a_batch_of_environments_whose_transforms_are_in_workers(started: bool) -> None:
+    batch = SerialEnv(2, point_nav)
+    if started:
+        batch.reset()
+    for env in (batch, TransformedEnv(batch, RewardSum())):
+        with pytest.raises(ValueError, match=r"before batching.*of a SerialEnv or ParallelEnv"):
+            constraint_bijectors(env)
+    batch.close(raise_if_closed=False)
+
+
+def test_a_geometry_that_the_centre_leaves_out_is_refused() -> None:
+    env = constrain_env(PointNavEnv([2]), BatteryGeometry()).append_transform(ObstacleGeometry())
+    with pytest.raises(ValueError, match=r"\['battery'\] that leaves out \['obstacle'\]"):
+        constraint_bijectors(env)
 
 
 def test_constrain_env_publishes_everything_the_actor_needs() -> None:
     base = TransformedEnv(PointNavEnv([3], seed=0), RewardSum())
     env = constrain_env(base, ObstacleGeometry(), BatteryGeometry(), order=ORDER)
     check_env_specs(env)
-    assert [bijector.name for bijector in constraint_bijectors(env)] == ["obstacle", "battery"]
+    assert names(env) == ORDER
     assert isinstance(base.transform, RewardSum)
     by_hand = TransformedEnv(
         PointNavEnv([3], seed=0), Compose(RewardSum(), BatteryGeometry(), ObstacleGeometry())
@@ -370,3 +431,24 @@ def test_constrain_env_publishes_everything_the_actor_needs() -> None:
     assert (given == expected).all()
     with pytest.raises(ValueError, match="order: expected each of the constraints"):
         constrain_env(base, BatteryGeometry(), order=ORDER)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "given"),
+    [
+        (BatteryGeometry, "the class BatteryGeometry"),
+        ([BatteryGeometry()], "list"),
+        (RewardSum(), "RewardSum"),
+    ],
+    ids=["class", "list", "other transform"],
+)
+def test_what_is_no_geometry_is_refused(wrong: Any, given: str) -> None:
+    with pytest.raises(TypeError, match=f"expected each to be a GeometryTransform, given {given};"):
+        constrain_env(PointNavEnv([2]), ObstacleGeometry(), wrong)
+
+
+def test_constrain_env_needs_a_geometry_and_a_list_for_an_order() -> None:
+    with pytest.raises(ValueError, match="geometries: expected at least one, given none"):
+        constrain_env(PointNavEnv([2]))
+    with pytest.raises(TypeError, match=r"order: .*given the string 'battery'"):
+        constrain_env(PointNavEnv([2]), BatteryGeometry(), order="battery")

@@ -70,3 +70,16 @@ def test_without_costs_there_must_be_indicators() -> None:
         _ = env.observation_spec
     with pytest.raises(ValueError, match="expected at least one, or None"):
         ConstraintCost({})
+
+
+@pytest.mark.parametrize(
+    ("indicators", "message"),
+    [
+        (fast, "indicators: expected a mapping .*given function; write ConstraintCost"),
+        ([fast], "indicators: expected a mapping .*given list"),
+        ({"fast": fast, "p": 3}, "indicator 'p': expected a function .*given 3"),
+    ],
+)
+def test_indicators_are_named_functions(indicators: object, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        ConstraintCost(indicators)  # type: ignore[arg-type]

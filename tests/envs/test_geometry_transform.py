@@ -1,12 +1,23 @@
 """The base of geometry transforms, through constraints that a user might write."""
 
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
 
-from cnfp_torchrl.envs import BatteryGeometry, GeometryTransform, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.envs import (
+    BatteryGeometry,
+    GeometryTransform,
+    ObstacleGeometry,
+    PointNavEnv,
+    constrain_env,
+)
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, GeometryError
 
 
@@ -152,3 +163,129 @@ def test_names_and_keys_must_fit_the_environment() -> None:
         _ = env_with(SpeedLimit("same"), SpeedLimit("same")).observation_spec
     with pytest.raises(KeyError, match=r"'far': expected to read \['lidar'\], given .*observation"):
         _ = env_with(SpeedLimit("far", in_keys=["lidar"])).observation_spec
+    with pytest.raises(TypeError, match=r"write in_keys=\['observation'\]"):
+        SpeedLimit("mine", in_keys="observation")
+
+
+# A user's mistakes --------------------------------------------------------------------------------
+
+
+class Told(GeometryTransform):
+    """Returns, or raises, what a function of the state does."""
+
+    def __init__(self, answer: Callable[[TensorDictBase], Any]) -> None:
+        super().__init__("told")
+        self.answer = answer
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Any:
+        return self.answer(tensordict)
+
+
+def raise_(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize("given", [None, torch.zeros(3, 2), Ball], ids=["None", "tensor", "class"])
+def test_what_is_no_set_is_refused_by_name(given: object) -> None:
+    message = r"'told', Told.constraint_set: expected it to return a ConstraintSet .*given "
+    with pytest.raises(TypeError, match=message + type(given).__name__):
+        constrain_env(PointNavEnv([3]), Told(lambda _: given))
+
+
+@pytest.mark.parametrize("error", [KeyError("lidar"), RuntimeError("odd"), ValueError("odd")])
+def test_errors_of_a_constraints_own_code_name_it(error: Exception) -> None:
+    with pytest.raises(type(error)) as caught:
+        constrain_env(PointNavEnv([3]), Told(lambda _: raise_(error)))
+    assert caught.value is error
+    assert error.__notes__ == ["raised by constraint 'told', Told.constraint_set"]
+
+
+def test_an_attribute_error_is_not_taken_for_a_missing_spec() -> None:
+    message = "'told', Told.constraint_set: AttributeError: .*no attribute 'observation'"
+    with pytest.raises(GeometryError, match=message) as caught:
+        constrain_env(PointNavEnv([3]), Told(lambda state: state.observation))
+    assert isinstance(caught.value.__cause__, AttributeError)
+
+
+def test_a_field_that_is_no_tensor_is_named() -> None:
+    env_of = Told(lambda state: Ball(state["observation"][..., :2], 0.5, validate_args=False))
+    with pytest.raises(GeometryError, match=r"'told' .*'radius': expected a .*tensor, given float"):
+        constrain_env(PointNavEnv([3]), env_of)
+
+
+def test_the_family_stays_the_same() -> None:
+    def undecided(state: TensorDictBase) -> ConstraintSet:
+        like = state["observation"][..., :2]
+        if (like == 0).all():
+            return Box(like - 1, like + 1)
+        return Ball(like, torch.ones_like(like[..., 0]))
+
+    env = constrain_env(PointNavEnv([3]), Told(undecided))
+    with pytest.raises(GeometryError, match=r"'told' .*expected a Box, .*before, given a Ball;"):
+        env.reset()
+
+
+@dataclass(frozen=True, eq=False)
+class Mine(Ball):
+    """A family of a user, with a slack of one's choice."""
+
+    def slack(self, action: torch.Tensor) -> torch.Tensor:
+        raise NotImplementedError
+
+
+def mine(state: TensorDictBase) -> Mine:
+    like = state["observation"][..., :2]
+    return Mine(like, torch.ones_like(like[..., 0]), validate_args=False)
+
+
+@pytest.mark.parametrize(
+    ("slack", "given"),
+    [
+        (lambda action: action, r"\(3, 2\)"),
+        (lambda action: action.sum(-1, keepdim=True), r"\(3, 1\)"),
+        (lambda action: action.sum(), r"\(\)"),
+        (lambda action: None, "NoneType"),
+    ],
+)
+def test_a_slack_has_the_batchs_shape(
+    monkeypatch: pytest.MonkeyPatch, slack: Callable[[torch.Tensor], Any], given: str
+) -> None:
+    monkeypatch.setattr(Mine, "slack", lambda self, action: slack(action))
+    message = r"'told', .*Mine.slack: for actions \(3, 2\) expected .*shape \(3,\), given "
+    with pytest.raises(GeometryError, match=message + given):
+        constrain_env(PointNavEnv([3]), Told(mine))
+
+
+@pytest.mark.parametrize(
+    "event_dims", [{}, {"center": 1}, {"center": 1, "raduis": 0}, {"center": 0, "radius": 0}]
+)
+def test_a_familys_event_dims_name_its_fields(
+    monkeypatch: pytest.MonkeyPatch, event_dims: dict[str, int]
+) -> None:
+    monkeypatch.setattr(Mine, "event_dims", event_dims)
+    message = r"'told' \(Mine\): expected event_dims .*\['center', 'radius'\], .*given "
+    with pytest.raises(GeometryError, match=message + re.escape(str(event_dims))):
+        constrain_env(PointNavEnv([3]), Told(mine))
+
+
+def test_a_family_must_state_its_event_dims() -> None:
+    @dataclass(frozen=True, eq=False)
+    class Stateless(Ball):
+        event_dims: ClassVar[Mapping[str, int]] = {}
+
+    with pytest.raises(GeometryError, match=r"\(Stateless\): expected event_dims"):
+        constrain_env(PointNavEnv([3]), Told(lambda _: Stateless(torch.zeros(2), torch.ones(()))))
+
+
+@pytest.mark.parametrize(
+    ("answer", "given"),
+    [(torch.zeros(3, 1), r"\(3, 1\)"), ([0.0, 0.0], "list")],
+)
+def test_a_safe_action_is_one_for_each_state(answer: object, given: str) -> None:
+    class Unsafe(SpeedLimit):
+        def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Any:
+            return answer
+
+    message = r"'unsafe', Unsafe.safe_action: expected None or a tensor of shape \(3, 2\), given "
+    with pytest.raises(GeometryError, match=message + given):
+        constrain_env(PointNavEnv([3]), Unsafe("unsafe"))

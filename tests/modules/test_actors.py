@@ -30,14 +30,22 @@ from torchrl.modules import (
     ValueOperator,
 )
 
-from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.envs import (
+    BatteryGeometry,
+    ObstacleGeometry,
+    PointNavEnv,
+    constrain_env,
+    constraint_bijectors,
+)
 from cnfp_torchrl.geometry import Ball
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     ConstraintBijector,
+    GaugeFlow,
     constrain,
     flow_head,
     guarded,
+    make_constrained_actor,
     with_reference_entropy,
 )
 
@@ -207,7 +215,7 @@ def test_several_samples_at_once(
 
 @pytest.mark.parametrize(
     ("order", "expected"),
-    [(None, ["obstacle", "battery"]), (["battery", "obstacle"], ["battery", "obstacle"])],
+    [(None, ["battery", "obstacle"]), (["obstacle", "battery"], ["obstacle", "battery"])],
 )
 def test_order(
     make_tanh_actor: MakeActor,
@@ -253,7 +261,7 @@ def test_an_actor_with_named_modules(
 def test_constraining_twice_keeps_both(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
 ) -> None:
-    obstacle, battery = bijectors
+    battery, obstacle = bijectors
     once = constrain(make_tanh_actor(), battery, flow="radial")
     twice = constrain(once, obstacle)
     assert flow_head(once).order == ["battery"]
@@ -266,7 +274,52 @@ def test_constraining_twice_keeps_both(
         constrain(once, battery)
 
 
+def test_constraining_again_may_change_the_flow_alone(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    actor = constrain(make_tanh_actor(), *bijectors)
+    again = constrain(actor, flow="gauge", order=["obstacle", "battery"])
+    assert isinstance(flow_head(again).flow, GaugeFlow)
+    assert flow_head(again).order == ["obstacle", "battery"]
+
+
+def test_the_order_is_the_environments(make_tanh_actor: MakeActor) -> None:
+    order = ["obstacle", "battery"]
+    env = constrain_env(PointNavEnv([8]), BatteryGeometry(), ObstacleGeometry(), order=order)
+    assert flow_head(constrain(make_tanh_actor(), *constraint_bijectors(env))).order == order
+
+
 # What is refused ----------------------------------------------------------------------------------
+
+
+def test_an_actor_cannot_be_constrained_by_nothing(make_tanh_actor: MakeActor) -> None:
+    with pytest.raises(ValueError, match=r"bijectors: expected at least one.*given none; pass"):
+        constrain(make_tanh_actor())
+
+
+def test_a_list_of_bijectors_must_be_unpacked(
+    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    for not_unpacked in (bijectors, tuple(bijectors)):
+        message = f"bijectors: .*given {type(not_unpacked).__name__}; unpack"
+        with pytest.raises(TypeError, match=message):
+            constrain(make_tanh_actor(), not_unpacked)  # type: ignore[arg-type]
+
+
+def test_a_string_is_no_sequence_of_names(
+    env: TransformedEnv,
+    make_tanh_actor: MakeActor,
+    network: nn.Module,
+    bijectors: list[ConstraintBijector],
+) -> None:
+    message = re.escape("order: expected a sequence of names, given the string 'battery'; write")
+    with pytest.raises(TypeError, match=message):
+        constrain(make_tanh_actor(), bijectors[0], order="battery")
+    spec = env.action_spec_unbatched
+    with pytest.raises(TypeError, match=message):
+        make_constrained_actor(network, spec, bijectors[:1], order="battery")
+    with pytest.raises(TypeError, match=re.escape("write in_keys=['observation']")):
+        make_constrained_actor(network, spec, bijectors, in_keys="observation")
 
 
 @pytest.mark.parametrize(

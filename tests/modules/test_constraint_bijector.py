@@ -148,3 +148,16 @@ def test_an_order_that_does_not_name_each_constraint_once_is_refused(
     expected = re.escape(str(list(names)))
     with pytest.raises(ValueError, match=f"order: .*{expected} exactly once, given {given}"):
         in_order([ConstraintBijector(name, Box) for name in names], order)
+
+
+def test_a_string_is_no_order() -> None:
+    # The letters of "ab" would be an order of these two.
+    bijectors = [ConstraintBijector(name, Box) for name in "ab"]
+    with pytest.raises(TypeError, match=r"order: .*given the string 'ab'; write order=\['ab'\]"):
+        in_order(bijectors, "ab")
+
+
+@pytest.mark.parametrize("wrong", ["a", [ConstraintBijector("a", Box)], Box])
+def test_what_is_no_bijector_has_no_place_in_an_order(wrong: object) -> None:
+    with pytest.raises(TypeError, match="expected each to be a ConstraintBijector, given"):
+        in_order([ConstraintBijector("b", Box), wrong], None)  # type: ignore[list-item]

@@ -25,7 +25,7 @@ AGENT = 2
 
 @pytest.fixture
 def guard(make_actor: MakeActor) -> ExecutedActionGuard:
-    return ExecutedActionGuard(flow_head(make_actor()))
+    return ExecutedActionGuard(make_actor())
 
 
 @pytest.fixture
@@ -175,8 +175,14 @@ def test_flows_without_a_guarantee_are_not_guarded(make_actor: MakeActor, flow: 
 
 
 def test_declared_keys_are_enough(make_actor: MakeActor, state: TensorDictBase) -> None:
-    head = flow_head(make_actor())
-    guard = ExecutedActionGuard(head)
-    SafeRandomPolicy(head)(state)
+    actor = make_actor()
+    guard = ExecutedActionGuard(actor)
+    SafeRandomPolicy(actor)(state)
     guard(state.select(*guard.in_keys))
     assert guard.out_keys == ["action"]
+
+
+def test_a_guard_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: MakeActor) -> None:
+    for wrong in (flow_head(make_actor()), make_tanh_actor()):
+        with pytest.raises(TypeError, match=r"actor: expected.*given"):
+            ExecutedActionGuard(wrong)

@@ -41,7 +41,7 @@ def test_random_actions_are_inside_where_uniform_ones_are_not(
     env: TransformedEnv, make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str
 ) -> None:
     many = state.expand(500, AGENTS).clone()
-    for name, held in inside(SafeRandomPolicy(flow_head(make_actor(flow=flow)))(many)).items():
+    for name, held in inside(SafeRandomPolicy(make_actor(flow=flow))(many)).items():
         assert held.all(), name
     uniform = [env.rand_action(state.clone())["action"] for _ in range(500)]
     results = inside(many.set("action", torch.stack(uniform)))
@@ -53,7 +53,7 @@ def test_random_actions_are_inside_where_uniform_ones_are_not(
 def test_it_is_random_under_every_exploration_type(
     make_actor: MakeActor, state: TensorDictBase, exploration: ExplorationType | None
 ) -> None:
-    policy = SafeRandomPolicy(flow_head(make_actor()))
+    policy = SafeRandomPolicy(make_actor())
     with set_exploration_type(exploration):
         first, second = (policy(state.clone())["action"] for _ in range(2))
     assert (first != second).all()
@@ -61,11 +61,17 @@ def test_it_is_random_under_every_exploration_type(
 
 @pytest.mark.parametrize("return_log_prob", [False, True])
 def test_declared_keys(make_actor: MakeActor, state: TensorDictBase, return_log_prob: bool) -> None:
-    policy = SafeRandomPolicy(flow_head(make_actor(return_log_prob=return_log_prob)))
+    policy = SafeRandomPolicy(make_actor(return_log_prob=return_log_prob))
     given = state.select(*policy.in_keys)
     out = policy(given)
     assert set(out.keys()) - {"constraints"} == set(policy.out_keys)
     assert ("action_log_prob" in policy.out_keys) == return_log_prob
+
+
+def test_it_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: MakeActor) -> None:
+    for wrong in (flow_head(make_actor()), make_tanh_actor()):
+        with pytest.raises(TypeError, match=r"actor: expected.*given"):
+            SafeRandomPolicy(wrong)
 
 
 # Warm-up ------------------------------------------------------------------------------------------

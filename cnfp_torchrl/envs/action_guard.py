@@ -1,0 +1,77 @@
+"""The transform that refuses to execute actions that break a constraint."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+from cnfp_torchrl.envs.centre import constraint_bijectors
+from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, require
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.guard import refuse_violations
+
+
+class ActionGuard(Transform):
+    """Raise before an action outside an active constraint's set or the action bounds is executed.
+
+    Whoever chose it: an actor, ``env.rand_action``, a collector's ``init_random_frames``. The check
+    is that of `cnfp_torchrl.modules.ExecutedActionGuard`, with zero tolerance, and never repairs.
+    Append it to an environment that publishes its constraints, after all that changes actions::
+
+        env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
+        env.append_transform(ActionGuard())
+
+    `torchrl.envs.check_env_specs` acts at random: call it before.
+
+    Raises:
+        ValueError: when the environment publishes no constraint or no centre.
+        ConstraintViolationError: at a step, naming constraint, batch index, action and slack.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Made once the environment is known; a module, to move with the environment.
+        self._head: ConstrainedFlowModule | None = None
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        head = self._flow_head()
+        action = require(tensordict, head.action_key, "call a policy before the step").detach()
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:
+            # What is not executed needs no check; the centre passes it.
+            mask = stepped.reshape(*tensordict.batch_size, 1)
+            action = torch.where(mask, action, tensordict.get(CENTRE_KEY).to(action.dtype))
+        refuse_violations(head.order, head.get_region(tensordict), action)
+        return tensordict
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        # Read at the root: batched environments must pass it to their workers.
+        state_spec = input_spec["full_state_spec"]
+        if state_spec is None:
+            state_spec = Composite(shape=input_spec.shape, device=input_spec.device)
+        published = self.parent.observation_spec
+        for key in self._flow_head().geometry_keys():
+            if key not in published.keys(True, True):
+                raise ValueError(
+                    f"ActionGuard: expected an environment that publishes {key}, given one that "
+                    "does not; make it with constrain_env"
+                )
+            state_spec[key] = published[key].clone()
+        input_spec["full_state_spec"] = state_spec
+        return input_spec
+
+    def _flow_head(self) -> ConstrainedFlowModule:
+        if self._head is None:
+            if self.parent is None:
+                raise RuntimeError(
+                    "ActionGuard: expected to be part of an environment, which knows the "
+                    "constraints, before use; append it with env.append_transform"
+                )
+            self._head = ConstrainedFlowModule(
+                self.parent.action_spec_unbatched,
+                constraint_bijectors(self.parent),
+                out_key=self.parent.action_key,
+            )
+        return self._head
