@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -201,14 +200,6 @@ class GeometryTransform(Transform, ABC):
             raise GeometryError(
                 f"{where}: expected a {self._family.__name__}, as in the states before, given a "
                 f"{family.__name__}; return sets of one family in all states"
-            )
-        fields = [field.name for field in dataclasses.fields(allowed)]
-        event_dims = getattr(family, "event_dims", {})
-        if set(event_dims) != set(fields) or not any(event_dims.values()):
-            raise GeometryError(
-                f"{where}: expected event_dims with the number of event dimensions of each field, "
-                f"{fields}, at least one of them with the actions' d, given {event_dims}; see "
-                "ConstraintSet, and decorate the family with @dataclass(frozen=True, eq=False)"
             )
         allowed.validate_shapes(where)
 

@@ -3,7 +3,7 @@
 from cnfp_torchrl.geometry.ball import Ball
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.centres import MINIMUM_SLACK, chebyshev_centre, lexicographic_centre
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, GeometryError
 from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.positive_part import PositivePart
@@ -16,6 +16,7 @@ from cnfp_torchrl.geometry.visible_region import VisibleRegion
 from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
 
 __all__ = [
+    "EROSION_IN_EPS",
     "MINIMUM_SLACK",
     "Ball",
     "Box",

@@ -240,6 +240,14 @@ class ConstraintSet(ABC):
         Raises:
             GeometryError: naming the field, the expected and the given.
         """
+        names = [field.name for field in dataclasses.fields(self)]
+        event_dims = getattr(self, "event_dims", {})
+        if set(event_dims) != set(names) or not any(event_dims.values()):
+            raise GeometryError(
+                f"{where}: expected event_dims with the number of event dimensions of each field, "
+                f"{names}, at least one of them with the actions' d, given {event_dims}; decorate "
+                "the family with @dataclass(frozen=True, eq=False)"
+            )
         dtypes = {name: getattr(value, "dtype", None) for name, value in self.fields().items()}
         for name, value in self.fields().items():
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):

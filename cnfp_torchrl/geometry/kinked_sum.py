@@ -80,7 +80,7 @@ class KinkedSumBound(ConstraintSet):
 
     def _side_at_exit(self, direction: Tensor, centre: Tensor) -> Tensor:
         """Return the slope of each term where the ray leaves the set, ``(*batch, d)``."""
-        centre, direction = torch.broadcast_tensors(centre, direction)
+        centre, direction, _ = torch.broadcast_tensors(centre, direction, self.bound.unsqueeze(-1))
         starts_up = (centre > 0) | ((centre == 0) & (direction > 0))
         ends_up = torch.where(direction == 0, starts_up, direction > 0)
         upper, lower = self.slopes(self.weights)

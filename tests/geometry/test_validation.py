@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -155,3 +156,18 @@ def test_a_region_needs_action_bounds_first() -> None:
         Region((ball,), t(0.0, 0.0))
     with pytest.raises(GeometryError, match="one action dimension"):
         Region((Box(t(-1.0), t(1.0)), ball), t(0.0, 0.0))
+
+
+@pytest.mark.parametrize("event_dims", [None, {"radius": 0}, {"center": 0, "radius": 0}])
+def test_a_family_must_state_its_event_dims(event_dims: dict[str, int] | None) -> None:
+    @dataclass(frozen=True, eq=False)
+    class Disc(ConstraintSet):
+        center: Tensor
+        radius: Tensor
+
+        slack = gauge = eroded = around = None
+
+    if event_dims is not None:
+        Disc.event_dims = event_dims
+    with pytest.raises(GeometryError, match=r"Disc: expected event_dims with .*'center', 'radius'"):
+        Disc(t(0.0, 0.0), torch.tensor(1.0))

@@ -1,0 +1,175 @@
+"""The example that a family is checked with: sets, centres inside them, and rays from those."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from cnfp_torchrl.geometry import MINIMUM_SLACK, Box, ConstraintSet
+
+DTYPES = (torch.float32, torch.float64)
+
+_DEPTHS = (0.3, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+"""Shares of the way from a boundary back to the centre, at which further centres are tried."""
+
+
+class View(NamedTuple):
+    """A centre, and ways from it to the action bounds.
+
+    Args:
+        centre: ``(B, d)``.
+        ways: ``(N, B, d)``; the bounds' gauge of each is about 1.
+    """
+
+    centre: Tensor
+    ways: Tensor
+
+    def cast(self, dtype: torch.dtype) -> View:
+        """Return the same in a dtype."""
+        return View(self.centre.to(dtype), self.ways.to(dtype))
+
+    def at(self, gauge: Tensor) -> Tensor:
+        """Return the points ``centre + way / gauge``, ``(N, B, d)``."""
+        return self.centre + self.ways / gauge.unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class Example:
+    """Sets and centres, flat and in float64, of numbers that float32 holds too.
+
+    Args:
+        sets: of batch shape ``(B,)``.
+        bounds: finite action bounds around the centres, of batch shape ``(B,)``.
+        views: one for each centre, the given one first.
+        random: what draws all random numbers.
+    """
+
+    sets: ConstraintSet
+    bounds: Box
+    views: tuple[View, ...]
+    random: torch.Generator
+
+    @classmethod
+    def of(
+        cls, sets: ConstraintSet, centre: Tensor, bounds: Box | None, samples: int, seed: int
+    ) -> Self:
+        """Flatten an example whose shapes are known to be right.
+
+        Raises:
+            ValueError: when the bounds are not finite or do not hold the centres.
+        """
+        batch = torch.broadcast_shapes(sets.batch_shape, centre.shape[:-1])
+        index = torch.arange(batch.numel(), device=centre.device)
+        flat = sets.select(batch, index).with_fields(lambda field, _: _rounded(field))
+        centre = _rounded(centre.detach().expand(*batch, -1).reshape(-1, centre.shape[-1]))
+        random = torch.Generator().manual_seed(seed)
+        if bounds is None:
+            around = _bounds_about(flat, centre, random)
+        else:
+            bounds = bounds.with_fields(lambda field, _: _rounded(field))
+            low, high = (each.expand(*batch, -1) for each in (bounds.low, bounds.high))
+            around = Box(low.reshape_as(centre), high.reshape_as(centre))
+        if not bool((around.slack(centre) > 0).all() and around.magnitude().isfinite().all()):
+            raise ValueError(
+                "bounds: expected finite action bounds with the centres strictly inside, given "
+                f"low {around.low.tolist()}, high {around.high.tolist()}"
+            )
+        example = cls(flat, around, (), random)
+        return replace(example, views=(example.view(centre, example.ways(samples)),))
+
+    @property
+    def size(self) -> Tensor:
+        """The size of the numbers that actions consist of, ``(B,)``."""
+        return self.bounds.magnitude()
+
+    def cast(self, dtype: torch.dtype) -> tuple[Box, ConstraintSet]:
+        """Return bounds and sets in a dtype."""
+        bounds = self.bounds.with_fields(lambda field, _: field.to(dtype))
+        return bounds, self.sets.with_fields(lambda field, _: field.to(dtype))
+
+    def normal(self, *shape: int) -> Tensor:
+        """Return standard normal numbers in float64."""
+        drawn = torch.randn(*shape, generator=self.random, dtype=torch.float64)
+        return drawn.to(self.bounds.low.device)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Return numbers between 0 and 1 in float64."""
+        drawn = torch.rand(*shape, generator=self.random, dtype=torch.float64)
+        return drawn.to(self.bounds.low.device)
+
+    def ways(self, count: int) -> Tensor:
+        """Return directions ``(count, B, d)``: Gaussian, on axes, diagonal, and nearly on axes."""
+        gauss = self.normal(count, *self.bounds.low.shape)
+        largest = gauss.abs() == gauss.abs().amax(-1, keepdim=True)
+        axis = torch.where(largest, gauss, 0.0)
+        kinds = torch.stack([gauss, axis, gauss.sign(), axis + 1e-6 * gauss, gauss])
+        each = torch.arange(count, device=gauss.device)
+        return kinds[each % len(kinds), each]
+
+    def view(self, centre: Tensor, directions: Tensor) -> View:
+        """Return the view from a centre in directions that are not zero."""
+        room = self.bounds.gauge(directions, centre).unsqueeze(-1)
+        return View(centre, _rounded(directions / room))
+
+    def actions(self, count: int) -> Tensor:
+        """Return actions ``(count, B, d)`` up to twice as far as the bounds, at all distances."""
+        centre = self.views[0].centre
+        view = self.view(centre, self.ways(count))
+        share = 2 * 1e-4 ** self.uniform(count, len(centre), 1)
+        return centre + view.ways * share
+
+    def with_centres_near_the_boundary(self, samples: int) -> Self:
+        """Return the example with further centres, as near as the search for centres may find any.
+
+        From each some ways lead straight towards the boundary, away from it and along it, where a
+        gauge that subtracts large numbers is worst.
+        """
+        given = self.views[0].centre
+        twice = [each.with_fields(lambda f, _: f.float()) for each in (self.bounds, self.sets)]
+        magnitude = twice[0].bounding_box().magnitude()
+        twice = [each.eroded(magnitude).eroded(magnitude) for each in twice]
+        twice = [each.with_fields(lambda field, _: field.double()) for each in twice]
+        views = [self.views[0]]
+        for way in self.ways(4):
+            gauge = torch.maximum(*(each.gauge(way, given) for each in twice)).unsqueeze(-1)
+            centre = given
+            for depth in _DEPTHS:
+                trial = _rounded(given + way * (1 - depth) / gauge)
+                slack = torch.minimum(*(each.slack(trial) for each in twice)).unsqueeze(-1)
+                centre = torch.where(slack >= MINIMUM_SLACK, trial, centre)
+            views.append(self.view(centre, self._ways_about(centre - given, samples)))
+        return replace(self, views=tuple(views))
+
+    def _ways_about(self, towards: Tensor, count: int) -> Tensor:
+        """Return directions of which half are towards, away or along, more or less."""
+        towards = torch.where(towards.abs().amax(-1, keepdim=True) > 0, towards, 1.0)
+        towards = towards / vector_norm(towards, dim=-1, keepdim=True)
+        ways = self.ways(count)
+        along = ways - (ways * towards).sum(-1, keepdim=True) * towards
+        along = along / vector_norm(along, dim=-1, keepdim=True).clamp(min=1e-9)
+        lean = 1e-7 ** self.uniform(count, *towards.shape[:1], 1)
+        kinds = torch.stack(
+            [ways, towards + lean * along, ways, lean * along - towards, ways, along + lean]
+        )
+        each = torch.arange(count, device=towards.device)
+        return kinds[each % len(kinds), each]
+
+
+def _rounded(value: Tensor) -> Tensor:
+    return value.detach().float().double()
+
+
+def _bounds_about(sets: ConstraintSet, centre: Tensor, random: torch.Generator) -> Box:
+    """Return bounds some times wider than the set is where it is narrow, not centred."""
+    ways = torch.randn(32, *centre.shape, generator=random, dtype=torch.float64).to(centre)
+    ways = ways / vector_norm(ways, dim=-1, keepdim=True)
+    length = sets.slack(centre).expand(ways.shape[:-1]).nan_to_num(1.0).clamp(1e-6, 1e6)
+    for _ in range(20):
+        inside = sets.contains(centre + length.unsqueeze(-1) * ways)
+        length = torch.where(inside, 2 * length, length)
+    half = length.amin(0).unsqueeze(-1)
+    return Box(_rounded(centre - 3 * half), _rounded(centre + 5 * half))

@@ -1,0 +1,222 @@
+"""Checks of slack, containment, and what the search for centres knows of a family."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from cnfp_torchrl.geometry import (
+    MINIMUM_SLACK,
+    Cone,
+    ConstraintSet,
+    KinkedSum,
+    Rows,
+    Superlevel,
+    lexicographic_centre,
+)
+from cnfp_torchrl.testing.example import Example
+from cnfp_torchrl.testing.family_error import FamilyError, called, require
+
+_COUNT = 200
+
+
+def check_slack_at_the_centre(example: Example) -> None:
+    """The given centre has a positive slack and is contained."""
+    centre = example.views[0].centre
+    slack = example.sets.slack(centre)
+    expected = "a positive slack at the given centre (or a centre inside the set)"
+    require(example.sets, "slack", slack > 0, expected, "a slack of", slack, centre=centre)
+    inside = example.sets.contains(centre)
+    require(
+        example.sets,
+        "contains",
+        inside,
+        "the given centre inside",
+        "a slack of",
+        slack,
+        centre=centre,
+    )
+
+
+def check_contains_agrees_with_slack(example: Example) -> None:
+    """`contains` is true where the slack is positive, false where it is negative."""
+    action = example.actions(5 * _COUNT)
+    slack = example.sets.slack(action)
+    require(example.sets, "slack", ~slack.isnan(), "a number", "it", slack, action=action)
+    inside = example.sets.contains(action)
+    agrees = ((slack > 0) == inside) | (slack.abs() <= 1e-9 * example.size)
+    expected = "actions inside where their slack is positive, and only there"
+    require(example.sets, "contains", agrees, expected, "a slack of", slack, action=action)
+
+
+def check_slack_bounds_the_distance(example: Example) -> None:
+    """No action nearer than the slack is outside."""
+    action = example.actions(_COUNT).requires_grad_()
+    slack = example.sets.slack(action)
+    (uphill,) = torch.autograd.grad(slack.nan_to_num().sum(), action)
+    action, slack = action.detach(), slack.detach()
+    reach = slack.clamp(min=0).minimum(1e3 * example.size) * (1 - 1e-6)
+    for way in (-uphill.nan_to_num(), *example.ways(8)):
+        length = vector_norm(way, dim=-1, keepdim=True)
+        near = action + way / torch.where(length > 0, length, 1.0) * reach.unsqueeze(-1)
+        inside = example.sets.contains(near) | (slack <= 1e-9 * example.size)
+        require(
+            example.sets,
+            "slack",
+            inside,
+            "the distance to the boundary or less, as nothing nearer than the slack is outside",
+            "a slack of",
+            slack,
+            action=action,
+            outside=near,
+        )
+
+
+def check_slack_is_concave(example: Example) -> None:
+    """The slack is concave and has a gradient that says so, unless `superlevel` is stated."""
+    sets = example.sets
+    if sets.superlevel() is not None:
+        return
+    holds, slack, chord, one, other = _chords(example)
+    require(
+        sets,
+        "slack",
+        holds,
+        "a concave function, at least the chord's value between two actions; otherwise the search "
+        "for centres drops sets that hold (if the set is not convex, state superlevel and "
+        "part_near)",
+        "a difference of",
+        slack - chord,
+        one_action=one,
+        other_action=other,
+    )
+    at = torch.cat([one, example.views[0].centre.unsqueeze(0)]).requires_grad_()
+    value = sets.slack(at)
+    (gradient,) = torch.autograd.grad(value.sum(), at)
+    ahead = torch.cat([other, example.actions(1)]) - at.detach()
+    linear = value.detach() + (gradient * ahead).sum(-1)
+    excess = sets.slack(at.detach() + ahead) - linear
+    require(
+        sets,
+        "slack",
+        excess <= _tolerance(example, value.detach()),
+        "a finite gradient whose linearisation lies above the slack everywhere",
+        "a slack that exceeds it by",
+        excess,
+        action=at.detach(),
+        gradient=gradient,
+        exceeded_at=at.detach() + ahead,
+    )
+
+
+def check_superlevel(example: Example) -> None:
+    """What `superlevel` and `part_near` describe has the slack that they say, and enough of it."""
+    sets = example.sets
+    part = called(type(sets), "superlevel", sets.superlevel)
+    if part is None:
+        return
+    action = example.actions(5 * _COUNT)
+    slack = sets.slack(action)
+    level = _check_part(example, "superlevel", part, action)
+    if type(sets).part_near is ConstraintSet.part_near:
+        complete = (slack <= 0) | (level >= slack - _tolerance(example, slack))
+        expected = "all actions with a slack of t described (if not convex, by part_near)"
+        require(
+            sets, "superlevel", complete, expected, "a difference of", level - slack, action=action
+        )
+        return
+    for point in action[:5]:
+        part = called(type(sets), "part_near", partial(sets.part_near, point))
+        level = _check_part(example, "part_near", part, torch.cat([point.unsqueeze(0), action]))[0]
+        slack = sets.slack(point)
+        complete = (slack <= 0) | (level >= slack - _tolerance(example, slack))
+        expected = "as much slack at the point in the part as in the set"
+        require(
+            sets, "part_near", complete, expected, "a difference of", level - slack, point=point
+        )
+
+
+def _check_part(example: Example, method: str, part: object, action: Tensor) -> Tensor:
+    """Return the slack that a part describes actions to have, no more than what they have."""
+    family, slack = type(example.sets), example.sets.slack(action)
+    if not isinstance(part, Rows | Cone | KinkedSum):
+        raise FamilyError(family, method, f"expected Rows, a Cone or a KinkedSum, given {part!r}")
+    level = called(family, method, partial(_level, part, action))
+    holds = (level <= 0) | (slack >= level - _tolerance(example, slack))
+    expected = "actions described as having a slack of t to have it"
+    require(example.sets, method, holds, expected, "a difference of", slack - level, action=action)
+    return level
+
+
+def check_search_keeps_the_set(example: Example) -> None:
+    """The search for centres keeps the set wherever the given centre has slack enough."""
+    sets, bounds, centre = example.sets, example.bounds, example.views[0].centre
+    method = "slack" if sets.superlevel() is None else "superlevel"
+    twice = [each.eroded(example.size).eroded(example.size) for each in (bounds, sets)]
+    slack = torch.minimum(*(each.slack(centre) for each in twice))
+    _, active = called(type(sets), method, lambda: lexicographic_centre([bounds, sets]))
+    kept = active[..., 1] | (slack < 2 * MINIMUM_SLACK)
+    expected = "the search for centres to keep the set wherever a centre has slack enough"
+    require(sets, method, kept, expected, "a slack of", slack, centre=centre)
+
+
+def check_bounding_box(example: Example) -> None:
+    """The bounding box holds what the set contains."""
+    box = example.sets.bounding_box()
+    points = [example.actions(5 * _COUNT)]
+    for view in example.views:
+        points.append(view.at(example.sets.gauge(view.ways, view.centre).clamp(min=1)))
+    action = torch.cat(points)
+    outside = example.sets.slack(action) < 0
+    slack = box.slack(action)
+    holds = outside | (slack >= -1e-7 * example.size)
+    expected = "every action of the set in the box"
+    require(example.sets, "bounding_box", holds, expected, "a slack in it of", slack, action=action)
+
+
+def check_contains_is_exact(example: Example) -> None:
+    """`contains` judges float32 actions at the boundary by float64 arithmetic."""
+    sets = example.cast(torch.float32)[1]
+    for view in example.views:
+        gauge = example.sets.gauge(view.ways, view.centre).clamp(min=0.25)
+        ulps = 4 * (example.uniform(*view.ways.shape) - 0.5) * torch.finfo(torch.float32).eps
+        action = (view.at(gauge) * (1 + ulps)).float()
+        slack = example.sets.slack(action.double())
+        same = sets.contains(action) == example.sets.contains(action.double())
+        # What float64 itself cannot tell.
+        same = same | (slack.abs() <= 1e-13 * example.size)
+        expected = "the float32 numbers judged in float64, also at the boundary"
+        require(sets, "contains", same, expected, "another answer at slack", slack, action=action)
+
+
+def _chords(example: Example) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return whether the slack is above chords, its value, the chord's, and the chord's ends."""
+    one, other = example.actions(_COUNT), example.actions(_COUNT).flip(0)
+    share = example.uniform(_COUNT, one.shape[1])
+    at_one, at_other = example.sets.slack(one), example.sets.slack(other)
+    between = example.sets.slack(one + (other - one) * share.unsqueeze(-1))
+    chord = torch.where(at_one.isinf(), -torch.inf, at_one + (at_other - at_one) * share)
+    return between >= chord - _tolerance(example, chord), between, chord, one, other
+
+
+def _tolerance(example: Example, slack: Tensor) -> Tensor:
+    """Return what rounding, of example and arithmetic, may make of a slack."""
+    return 1e-7 * (example.size + slack.abs().nan_to_num(posinf=0.0))
+
+
+def _level(part: Superlevel, action: Tensor) -> Tensor:
+    """Return the largest slack t for which an action is described."""
+    match part:
+        case Rows(normals, offsets, rates):
+            room = offsets - (normals * action.unsqueeze(-2)).sum(-1)
+            free = torch.where(room >= 0, torch.inf, -torch.inf)
+            return torch.where(rates > 0, room / rates, free).amin(-1)
+        case Cone(matrix, vector, size, rate):
+            image = (matrix * action.unsqueeze(-2)).sum(-1) + vector
+            return (size - vector_norm(image, dim=-1)) / rate
+        case KinkedSum(upper, lower, size, rate):
+            room = size - torch.maximum(upper * action, lower * action).sum(-1)
+            return torch.where(rate > 0, room / rate, torch.where(room >= 0, torch.inf, -torch.inf))

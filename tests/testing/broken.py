@@ -1,0 +1,298 @@
+"""Families that are wrong in one way each, and the method that the checker has to name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from cnfp_torchrl.geometry import Ball, Box, Cone, ConstraintSet, Rows, VisibleRegion
+from cnfp_torchrl.geometry.constraint_set import Gauge
+
+
+class PlainBall(Ball):
+    """A ball of which each method is its own, so that a broken one breaks nothing else."""
+
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        return lambda direction: self.gauge(direction, centre)
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return Ball(self.center, self.radius, validate_args=False).gauge(direction, centre)
+
+    def superlevel(self) -> Any:
+        return None
+
+    unless_dropped = ConstraintSet.unless_dropped
+
+
+class GaugeOfTheWrongSign(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return super().gauge(-direction, centre)
+
+
+class GaugeAboutTheMiddle(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return vector_norm(direction, dim=-1) / self.radius
+
+
+class CancellingGauge(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        w = centre - self.center
+        b, k = (direction * w).sum(-1), self.radius**2 - (w * w).sum(-1)
+        return (b + (b * b + (direction * direction).sum(-1) * k).sqrt()) / k
+
+
+class CancellingOnTheWayBack(PlainBall):
+    """It subtracts where the direction leads away from the boundary only."""
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        w = centre - self.center
+        distance = vector_norm(w, dim=-1)
+        k = (self.radius - distance) * (self.radius + distance)
+        b = (direction * w).sum(-1)
+        return (b + (b * b + (direction * direction).sum(-1) * k).sqrt()) / k
+
+
+class GaugeThatIsNotHomogeneous(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return super().gauge(direction, centre) + 1e-9
+
+
+class GaugeOfFourthPowers(PlainBall):
+    """Right, but the powers of short directions are no numbers that float32 has."""
+
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        length = direction.pow(4).sum(-1).pow(0.25)
+        return super().gauge(direction / length.unsqueeze(-1), centre) * length
+
+
+class GaugeWithNanAtKinks(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        # Zero, but for the gradient.
+        length = (direction * direction).sqrt().sum(-1)
+        return super().gauge(direction, centre) + 0 * length
+
+
+class GaugeWithoutGradient(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return super().gauge(direction.detach(), centre) + 0 * direction.sum(-1)
+
+
+class GaugeThatMixesTheBatch(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return direction.norm(dim=-1) / (self.radius - (centre - self.center).norm()).min()
+
+
+class GaugeOfTheWrongShape(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return super().gauge(direction, centre).unsqueeze(-1)
+
+
+class GaugeThatRaises(PlainBall):
+    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+        return direction @ centre
+
+
+class GaugeAboutOfAnotherCentre(PlainBall):
+    def gauge_about(self, centre: Tensor) -> Gauge:
+        return lambda direction: self.gauge(direction, self.center)
+
+
+class NoErosion(PlainBall):
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        return self
+
+
+class ErosionOfTheRadiusAlone(PlainBall):
+    """Not of the centre, which may be the larger number."""
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = torch.finfo(self.dtype).eps
+        return type(self)(self.center, self.radius * (1 - eps), validate_args=False)
+
+
+class ErosionByAShare(PlainBall):
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        return type(self)(self.center, self.radius * (1 - 1e-4), validate_args=False)
+
+
+class ErosionToAnotherShape(PlainBall):
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        return type(self)(self.center, self.radius.unsqueeze(-1), validate_args=False)
+
+
+class SlackThatIsNotConcave(PlainBall):
+    def slack(self, action: Tensor) -> Tensor:
+        distance = vector_norm(action - self.center, dim=-1)
+        return (self.radius - distance) / (1 + distance)
+
+
+class SlackBeyondTheDistance(PlainBall):
+    def slack(self, action: Tensor) -> Tensor:
+        return 2 * super().slack(action)
+
+
+class SlackOfTheWrongShape(PlainBall):
+    def slack(self, action: Tensor) -> Tensor:
+        return super().slack(action).unsqueeze(-1)
+
+
+class SlackWithoutGradient(PlainBall):
+    def slack(self, action: Tensor) -> Tensor:
+        return super().slack(action.detach()) + 0 * action.sum(-1)
+
+
+class SlackWithNan(PlainBall):
+    def slack(self, action: Tensor) -> Tensor:
+        return self.radius - vector_norm(action - self.center, dim=-1).sub(self.radius).sqrt()
+
+
+class ContainsInItsOwnDtype(PlainBall):
+    def contains(self, action: Tensor) -> Tensor:
+        return vector_norm(action - self.center, dim=-1) <= self.radius
+
+
+class ContainsTheOpenOutside(PlainBall):
+    def contains(self, action: Tensor) -> Tensor:
+        return vector_norm(action.double() - self.center, dim=-1) <= 1.1 * self.radius
+
+
+class AroundTooSmall(PlainBall):
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        return super().around(centre, 0.9 * radius)
+
+
+class AroundTooSmallIfLarge(PlainBall):
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        return super().around(centre, torch.where(self.radius > 1.9, 0.9, 1.0) * radius)
+
+
+class AroundItself(PlainBall):
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        return type(self)(self.center, self.radius + radius, validate_args=False)
+
+
+class AroundOfAnotherShape(PlainBall):
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        return type(self)(centre, radius.unsqueeze(-1), validate_args=False)
+
+
+class AroundNotWritten(PlainBall):
+    def around(self, centre: Tensor, radius: Tensor) -> Self:
+        raise NotImplementedError("around")
+
+
+class DroppedByInfinity(PlainBall):
+    """Infinite radii do not bind, but their gradients are no numbers."""
+
+    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
+        wide = torch.where(active, self.radius, torch.inf)
+        return type(self)(self.center, wide, validate_args=False)
+
+
+class SmallBoundingBox(PlainBall):
+    def bounding_box(self) -> Box:
+        half = 0.99 * self.radius.unsqueeze(-1)
+        return Box(self.center - half, self.center + half, validate_args=False)
+
+
+class SuperlevelElsewhere(PlainBall):
+    def superlevel(self) -> Cone:
+        cone = Ball.superlevel(self)
+        return Cone(cone.matrix, -cone.vector, cone.size, cone.rate)
+
+
+class SuperlevelOfAPart(PlainBall):
+    """Sound, but then a set is dropped that holds."""
+
+    def superlevel(self) -> Cone:
+        cone = Ball.superlevel(self)
+        return Cone(cone.matrix, cone.vector, 0.5 * cone.size, cone.rate)
+
+
+class PartThatIgnoresThePoint(VisibleRegion):
+    def part_near(self, point: Tensor) -> Rows:
+        return super().part_near(torch.zeros_like(self.position))
+
+
+class ViolationsOfTheExample(PlainBall):
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "radius", self.radius > 0, "a negative radius"
+
+
+class ViolationsOfNoField(PlainBall):
+    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "size", self.radius <= 0, "a size > 0"
+
+
+class EventDimsOfTheRadius(PlainBall):
+    event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 1}
+
+
+class EventDimsOfTheCentre(PlainBall):
+    event_dims: ClassVar[Mapping[str, int]] = {"center": 0, "radius": 0}
+
+
+class EventDimsAsATuple(PlainBall):
+    event_dims: ClassVar[Any] = (1, 0)
+
+
+class EventDimsOfOtherFields(PlainBall):
+    event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "size": 0}
+
+
+@dataclass(frozen=True, eq=False)
+class NoEventDims(ConstraintSet):
+    center: Tensor
+    radius: Tensor
+
+    slack = Ball.slack  # type: ignore[assignment]
+    gauge = Ball.gauge  # type: ignore[assignment]
+    eroded = Ball.eroded  # type: ignore[assignment]
+    around = Ball.around  # type: ignore[assignment]
+
+
+BROKEN: list[tuple[type[ConstraintSet], str]] = [
+    (GaugeOfTheWrongSign, "gauge"),
+    (GaugeAboutTheMiddle, "gauge"),
+    (CancellingGauge, "gauge"),
+    (CancellingOnTheWayBack, "gauge"),
+    (GaugeThatIsNotHomogeneous, "gauge"),
+    (GaugeOfFourthPowers, "gauge"),
+    (GaugeWithNanAtKinks, "gauge"),
+    (GaugeWithoutGradient, "gauge"),
+    (GaugeThatMixesTheBatch, "gauge"),
+    (GaugeOfTheWrongShape, "gauge"),
+    (GaugeThatRaises, "gauge"),
+    (GaugeAboutOfAnotherCentre, "gauge_about"),
+    (NoErosion, "eroded"),
+    (ErosionOfTheRadiusAlone, "eroded"),
+    (ErosionByAShare, "eroded"),
+    (ErosionToAnotherShape, "eroded"),
+    (SlackThatIsNotConcave, "slack"),
+    (SlackBeyondTheDistance, "slack"),
+    (SlackOfTheWrongShape, "slack"),
+    (SlackWithoutGradient, "slack"),
+    (SlackWithNan, "slack"),
+    (ContainsInItsOwnDtype, "contains"),
+    (ContainsTheOpenOutside, "contains"),
+    (AroundTooSmall, "around"),
+    (AroundItself, "around"),
+    (AroundOfAnotherShape, "around"),
+    (AroundNotWritten, "around"),
+    (DroppedByInfinity, "unless_dropped"),
+    (SmallBoundingBox, "bounding_box"),
+    (SuperlevelElsewhere, "superlevel"),
+    (SuperlevelOfAPart, "superlevel"),
+    (ViolationsOfTheExample, "violations"),
+    (ViolationsOfNoField, "violations"),
+    (EventDimsOfTheRadius, "event_dims"),
+    (EventDimsOfTheCentre, "event_dims"),
+    (EventDimsAsATuple, "event_dims"),
+    (EventDimsOfOtherFields, "event_dims"),
+    (NoEventDims, "event_dims"),
+]
