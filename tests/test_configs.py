@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig
 
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -16,6 +18,13 @@ TINY = [
     "evaluation.episodes=2",
     "+env.base.max_steps=5",
 ]
+
+
+def composed(*overrides: str, name: str = "train") -> DictConfig:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
 OPTIONS = sorted(
     str(path.relative_to(config_directory()).with_suffix(""))
     for path in config_directory().glob("*/**/*.yaml")
@@ -27,13 +36,28 @@ OPTIONS = sorted(
 @pytest.mark.parametrize("option", OPTIONS)
 def test_every_option_runs(option: str, tmp_path: Path) -> None:
     group, _, name = option.rpartition("/")
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=["figures=none", f"{group}={name}", *TINY])
+    config = composed("figures=none", f"{group}={name}", *TINY)
     summary = train(config, RunFolder.create(tmp_path / "run"))
     assert summary["steps"] == 64
 
 
 @pytest.mark.parametrize("name", ["train", "evaluate", "audit"])
 def test_every_main_configuration_composes(name: str) -> None:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        assert compose(name)
+    assert composed(name=name)
+
+
+def test_an_unknown_experiment_is_refused_with_the_choices() -> None:
+    with pytest.raises(MissingConfigException, match=r"(?s)lagrangain.*lagrangian"):
+        composed("experiment=lagrangain")
+
+
+def test_an_experiment_overrides_the_main_file_and_the_command_line_overrides_it(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\nseed: 7\ntraining:\n  log_interval: 70\n"
+    )
+    own = ["experiment=mine", f"hydra.searchpath=[file://{tmp_path}]"]
+    config = composed(*own, "training.log_interval=80")
+    assert (config.seed, config.training.log_interval) == (7, 80)

@@ -32,7 +32,11 @@ def build_environment(
         with_centre: publish centre and active flags also where the flow does not need them.
         with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
+
+    Raises:
+        ValueError: when the environment has no geometry of the name ``flow.obstacle``.
     """
+    _require_obstacle(config)
     flow: Flow = instantiate(config.flow.combine)
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
@@ -46,6 +50,14 @@ def build_environment(
     )
 
 
+def _require_obstacle(config: DictConfig) -> None:
+    choices = config.env.get("obstacle_geometry")
+    if choices is not None and config.flow.obstacle not in choices:
+        raise ValueError(
+            f"flow.obstacle: expected one of {list(choices)}, given {config.flow.obstacle!r}"
+        )
+
+
 def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
     """Return the actor of a configuration for an environment."""
     observation_size = env.observation_spec["observation"].shape[-1]
@@ -53,7 +65,7 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
     return make_constrained_actor(
         instantiate(config.network.actor, observation_size, action_size),
         env.action_spec_unbatched,
-        constraint_bijectors(env),
+        constraint_bijectors(env) if config.env.geometry else [],
         order=list(config.flow.order),
         flow=instantiate(config.flow.combine),
     )

@@ -41,11 +41,12 @@ def make_environment(
             raise ValueError(
                 f"env.geometry.{name}.name: expected '{name}', given '{geometry.name}'"
             )
-    env = TransformedEnv(base, Compose(*geometries.values(), RewardSum()))
+    env = TransformedEnv(base, Compose(*geometries.values(), RewardSum()), auto_unwrap=True)
     if penalty is not None:
         env.append_transform(penalty)
     if with_centre:
-        env.append_transform(ConstraintCentre(constraint_bijectors(env), order))
+        bijectors = constraint_bijectors(env) if geometries else []
+        env.append_transform(ConstraintCentre(bijectors, order))
     return env
 
 

@@ -13,15 +13,14 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
 
 from cnfp_torchrl.configuration import config_directory
-from cnfp_torchrl.modules import ConstrainedFlowModule, SafeRandomPolicy, flow_head, guarded
+from cnfp_torchrl.modules import SafeRandomPolicy, constrain, flow_head, guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.baselines import StandStill
-from cnfp_torchrl.training.evaluation import evaluate_seeded
+from cnfp_torchrl.training.evaluation import Policy, evaluate_seeded
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.settings import EvaluationSettings, require_settings
 from cnfp_torchrl.training.watching import RECORDING, Watch, watch_run
 
 
@@ -38,13 +37,13 @@ def evaluate_run(
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[settings.episodes], with_centre=True)
     actor = load_actor(folder, config, env)
-    bijectors = flow_head(actor).bijectors
-    exact = ConstrainedFlowModule(env.action_spec_unbatched, bijectors, flow="exact")
+    safe = constrain(actor, flow="exact")
+    exact = flow_head(safe)
     score = instantiate(config.env.get("score"))
-    policies: dict[str, tuple[TensorDictModuleBase, bool]] = {
+    policies: dict[str, tuple[Policy, bool]] = {
         "trained, stochastic": (guarded(actor), False),
         "trained, deterministic": (guarded(actor), True),
-        "safe random": (SafeRandomPolicy(exact), False),
+        "safe random": (SafeRandomPolicy(safe), False),
         "standing still": (StandStill(exact), False),
     }
     for name, make in instantiate(config.env.get("baselines") or {}).items():
@@ -75,6 +74,7 @@ def table(reports: Mapping[str, Mapping[str, Any]]) -> str:
 @hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
 def main(config: DictConfig) -> None:
     """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""
+    require_settings(config)
     settings: EvaluationSettings = instantiate(config.evaluation)
     watch: Watch | None = instantiate(config.visual, _convert_="all") or None
     trusted = tuple(config.trusted)

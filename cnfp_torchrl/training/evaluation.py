@@ -9,13 +9,15 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.training.environment import counted_constraints
-from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.settings import NUMBER, EvaluationSettings
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+"""Writes the action into a tensordict of states: any TorchRL policy."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,22 @@ class LinearScore:
     Args:
         zero: the return that scores 0.
         one: the return that scores 1.
+
+    Raises:
+        ValueError: for a reference that is no number, and for two equal ones.
     """
 
     zero: float
     one: float
+
+    def __post_init__(self) -> None:
+        NUMBER.require("env.score.zero", self.zero)
+        NUMBER.require("env.score.one", self.one)
+        if self.zero == self.one:
+            raise ValueError(
+                f"env.score.one: expected another return than env.score.zero, given {self.one} for "
+                "both"
+            )
 
     def __call__(self, return_mean: float) -> float:
         """Return the score of a mean return."""
@@ -74,7 +88,7 @@ class Evaluation:
 
 def evaluate_seeded(
     env: EnvBase,
-    policy: TensorDictModuleBase,
+    policy: Policy,
     settings: EvaluationSettings,
     *,
     deterministic: bool = False,
@@ -97,7 +111,7 @@ def evaluate_seeded(
 @torch.no_grad()
 def evaluate(
     env: EnvBase,
-    policy: TensorDictModuleBase,
+    policy: Policy,
     *,
     episodes: int,
     deterministic: bool = False,
@@ -143,7 +157,7 @@ def evaluate(
     return Evaluation(kept, torch.cat(costs)[:episodes], names, steps)
 
 
-def transitions(env: EnvBase, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
+def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
     """Reset an environment and yield its transitions under a policy, without end."""
     state: TensorDictBase = env.reset()
     while True:

@@ -23,7 +23,12 @@ from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings
+from cnfp_torchrl.training.settings import (
+    EvaluationSettings,
+    TrainingSettings,
+    require_frames,
+    require_settings,
+)
 from cnfp_torchrl.training.watching import (
     RECORDING,
     EpisodeCollector,
@@ -43,10 +48,15 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
 
     Returns:
         The summary that is also written to ``summary.json``.
+
+    Raises:
+        ValueError: before any work, for a setting that makes no sense.
     """
     started = time.perf_counter()
+    require_settings(config)
     settings: TrainingSettings = instantiate(config.training)
     judgement: EvaluationSettings = instantiate(config.evaluation)
+    require_frames(config)
     score = instantiate(config.env.get("score"))
     watch: Watch | None = instantiate(config.visual, _convert_="all") or None
     torch.manual_seed(config.seed)

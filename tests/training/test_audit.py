@@ -149,7 +149,8 @@ def test_too_large_a_set_is_caught_with_its_state(reports: Callable[..., AuditRe
     assert report.executed.led_into["disc"] == report.executed.violations["disc"] > 0
     (example, *_) = report.executed.examples["disc"]
     assert torch.tensor(example["action"]).norm() > example["state"]["observation"][0]
-    text = as_text(report)
+    text = str(report)
+    assert text == as_text(report)
     assert "FLAW: disc, uniform" in text
     assert f"{report.flaws[0].split(': ')[1].split(' actions')[0]}" in text
 
@@ -223,12 +224,25 @@ class FreshWalk(Walk, Fresh):
 
 
 @pytest.mark.parametrize(
-    ("base", "message"), [(FreshWalk, "steps to another 'observation'"), (Uncopied, "but one")]
+    ("base", "message"),
+    [(FreshWalk, "steps to another 'observation'"), (Uncopied, r"but one.*place")],
 )
 def test_environments_that_cannot_be_copied_are_refused(base: type[Disc], message: str) -> None:
     env = with_geometry(base(4), Share_(0.8))
     with pytest.raises(TypeError, match=message):
         audit(env, settings=AuditSettings(states=4, actions=4, steps=3))
+
+
+def test_a_place_for_the_bare_environment_and_its_observation_is_enough() -> None:
+    def place_bare(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+        assert type(env) is FreshWalk
+        env.limit = states["observation"].clone()
+        return TensorDict({"observation": env.limit}, env.batch_size)
+
+    env = with_geometry(FreshWalk(64), Share_(1.05))
+    report = audit(env, place=place_bare, settings=SMALL)
+    assert list(report.sources) == ["rollouts", "uniform"]
+    assert any(flaw.startswith("disc, uniform") for flaw in report.flaws)
 
 
 def test_a_place_that_misses_is_refused() -> None:
@@ -263,7 +277,7 @@ def test_a_constraint_without_indicator_is_not_judged() -> None:
 
 
 def test_wrong_environments_are_explained() -> None:
-    with pytest.raises(ValueError, match="at least one constraint's geometry"):
+    with pytest.raises(ValueError, match="at least one constraint, given Disc"):
         audit(Disc(4))
     with pytest.raises(ValueError, match=r"key 'cost': expected \(4, 1\).*given none"):
         audit(with_geometry(Disc(4, cost=False), Share_(0.8)))
@@ -273,7 +287,7 @@ def test_wrong_environments_are_explained() -> None:
 
 @pytest.mark.parametrize("name", ["states", "actions", "steps"])
 def test_nothing_to_try_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"audit.{name}: expected a number >= 1, given 0"):
+    with pytest.raises(ValueError, match=rf"audit.{name}: expected a whole number >= 1, given 0"):
         AuditSettings(**{name: 0})
 
 

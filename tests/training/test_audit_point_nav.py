@@ -172,8 +172,13 @@ def test_a_trained_run_is_audited(
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("audit.states=0", "audit.states: expected a number >= 1, given 0"),
-        ("batch=0", "batch: expected a number >= 1, given 0"),
+        ("audit.states=0", "audit.states: expected a whole number >= 1, given 0"),
+        ("audit.states=many", "audit.states: expected a whole number >= 1, given 'many'"),
+        ("audit.seed=abc", "audit.seed: expected a whole number >= 0, given 'abc'"),
+        ("audit.strict=maybe", "audit.strict: expected true or false, given 'maybe'"),
+        ("batch=0", "batch: expected a whole number >= 1, given 0"),
+        ("batch=many", "batch: expected a whole number >= 1, given 'many'"),
+        ("flow.obstacle=visble", r"flow.obstacle: expected one of \['box', 'visible'\]"),
         ("run=absent", "lacks"),
     ],
 )

@@ -69,7 +69,8 @@ assert "cnfp_torchrl.visual" not in sys.modules
 
 
 def test_off_imports_nothing(tmp_path: Path) -> None:
-    tiny = ["collector.total_frames=32", "evaluation.episodes=2", "+env.base.max_steps=4"]
+    tiny = ["collector.total_frames=32", "training.warmup_frames=16", "training.update_ratio=0.1"]
+    tiny += ["evaluation.episodes=2", "+env.base.max_steps=4"]
     done = subprocess.run(
         [sys.executable, "-c", OFF, tmp_path / "run", *tiny, "logger=none"],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -206,12 +207,15 @@ def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["visual=file", "visual.every=0"], "visual.every: expected a number >= 1, given 0"),
-        (["visual=file", "visual.episodes=0"], "visual.episodes: expected a number >= 1"),
+        (["visual=file", "visual.every=0"], "visual.every: expected a whole number >= 1, given 0"),
+        (["visual=file", "visual.episodes=0"], "visual.episodes: expected a whole number >= 1"),
         (["visual=file", "visual.projections=[[0,7]]"], "projection"),
         (["visual=spawn"], "visual=spawn: expected a display"),
         (["visual=connect", "visual.viewer.url=rerun+http://127.0.0.1:1/proxy"], "found none"),
-        (["visual=serve", "visual.viewer.port=70000"], "viewer.port: expected a free port"),
+        (
+            ["visual=serve", "visual.viewer.port=70000"],
+            "viewer.port: expected a port from 1 to 65535",
+        ),
     ],
 )
 def test_what_cannot_be_shown_is_refused_before_anything_is_left(

@@ -17,6 +17,7 @@ from cnfp_torchrl.visual.explain_run import explain_run, main
 
 TINY = [
     "collector.total_frames=64",
+    "training.warmup_frames=64",
     "training.update_ratio=0.05",
     "evaluation.episodes=3",
     "+env.base.max_steps=8",
@@ -78,7 +79,7 @@ def test_the_command_prints_it(
         (["--step", "8"], "--step: expected a number from 0 to 7, the last of episode 0, given 8"),
         (["--step", "-1"], "--step: expected a number >= 0, given -1"),
         (["--step", "0", "--episode", "3"], "--episode: expected a number from 0 to 2, given 3"),
-        (["--step", "0", "--episodes", "0"], "evaluation.episodes: expected a number >= 1"),
+        (["--step", "0", "--episodes", "0"], "evaluation.episodes: expected a whole number >= 1"),
         (["--step", "few"], "invalid int value: 'few'"),
         ([], "--step"),
     ],

@@ -27,7 +27,6 @@ from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     ConstraintBijector,
     Flow,
-    SafeRandomPolicy,
     flow_head,
 )
 from cnfp_torchrl.training.audit.measures import executed, findings, worst_scene
@@ -42,6 +41,17 @@ from cnfp_torchrl.training.audit.states import (
     uniform_states,
 )
 from cnfp_torchrl.training.audit.trial import run_trial
+from cnfp_torchrl.training.settings import COUNT, FLAG, WHOLE
+
+_EXPECTED = {
+    "states": COUNT,
+    "actions": COUNT,
+    "steps": COUNT,
+    "uniform": FLAG,
+    "examples": WHOLE,
+    "strict": FLAG,
+    "seed": WHOLE,
+}
 
 
 @dataclass(frozen=True)
@@ -70,9 +80,8 @@ class AuditSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("states", 1), ("actions", 1), ("steps", 1), ("examples", 0)):
-            if (given := getattr(self, name)) < least:
-                raise ValueError(f"audit.{name}: expected a number >= {least}, given {given}")
+        for name, expected in _EXPECTED.items():
+            expected.require(f"audit.{name}", getattr(self, name))
 
 
 @torch.no_grad()
@@ -89,21 +98,32 @@ def audit(
 ) -> AuditReport:
     """Audit the geometry that an environment publishes; see the module for what is asked.
 
-    States come from rollouts and, where the environment can be put into any state, uniformly from
-    its observation spec (normally distributed where that is unbounded). Without `place` the actions
-    are judged by copies of the environment, which must then be copyable, and there are no uniform
-    states.
+    Any environment will do that has these three:
+
+    - geometry, centre and active flags: `cnfp_torchrl.envs.constrain_env` publishes them;
+    - judges, by the constraints' names: a `cnfp_torchrl.envs.ConstraintCost` with indicators, or
+      its own ``cost`` and ``constraint_names``, or `indicators`;
+    - a way back into a state, to try many actions in it: ``copy.deepcopy`` keeps its state, as
+      with environments in PyTorch and Gymnasium's classic control, but not with MuJoCo; or `place`,
+      which is faster::
+
+        def place(env, states):  # env without its transforms, states of its batch size
+            env.my_state = states["observation"].clone()
+            return TensorDict({"observation": env.my_observation()}, env.batch_size)
+
+    States come from rollouts and, with `place`, also uniformly from the observation spec (normally
+    distributed where that is unbounded).
 
     Args:
-        env: with geometry, centre, active flags and indicators; it is reset. With a larger batch
-            the audit is faster.
+        env: the environment; it is reset. With a larger batch the audit is faster.
         bijectors: one for each constraint; None takes those of the geometry transforms.
         order: see `cnfp_torchrl.modules.ConstrainedFlowModule`.
         flow: see `cnfp_torchrl.modules.ConstrainedFlowModule`.
         actor: a constrained one that acts in the rollouts, and whose flow is audited instead; None
             takes safe random actions.
         indicators: named indicators that judge a step; None takes the environment's ``cost``.
-        place: puts the environment into given states; None knows point navigation.
+        place: puts the environment into given states, see `Place`; None knows point navigation,
+            and copies any other environment.
         settings: how much is tried.
 
     Raises:
@@ -124,7 +144,7 @@ def audit(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         env.set_seed(settings.seed)
-        policy = SafeRandomPolicy(head) if actor is None else actor
+        policy = head.random if actor is None else actor
         # Each copy is of another time.
         steps = max(settings.steps, copies)
         record = roll_out(env, policy, reader, steps=steps, copies=copies)
@@ -176,8 +196,8 @@ def _head(
     bijectors = constraint_bijectors(env) if bijectors is None else bijectors
     if not bijectors:
         raise ValueError(
-            f"env: expected one that publishes at least one constraint's geometry, given "
-            f"{type(env).__name__} without a GeometryTransform; append one, or pass bijectors"
+            "bijectors: expected one for at least one constraint, given none; leave them out to "
+            "take those of the environment's geometry transforms"
         )
     return ConstrainedFlowModule(
         env.action_spec_unbatched, bijectors, order=order, flow=flow, out_key=env.action_key

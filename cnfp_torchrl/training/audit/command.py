@@ -16,8 +16,8 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.audit.auditing import AuditSettings, audit
 from cnfp_torchrl.training.audit.report import AuditReport
-from cnfp_torchrl.training.audit.table import as_text
 from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import require_settings
 
 FLAWS_FOUND = 3
 """The exit code where flaws were found; 1 is an audit that could not be done."""
@@ -25,9 +25,8 @@ FLAWS_FOUND = 3
 
 def audit_configured(config: DictConfig) -> AuditReport:
     """Return the audit of a configuration composed from ``conf/audit.yaml``."""
+    require_settings(config)
     settings: AuditSettings = instantiate(config.audit)
-    if config.batch < 1:
-        raise ValueError(f"batch: expected a number >= 1, given {config.batch}")
     chosen, folder = config, None
     if config.run is not None:
         folder = RunFolder.open(config.run)
@@ -38,7 +37,7 @@ def audit_configured(config: DictConfig) -> AuditReport:
         order=list(chosen.flow.order),
         flow=instantiate(chosen.flow.combine),
         actor=None if folder is None else load_actor(folder, chosen, env),
-        place=instantiate(config.place),
+        place=instantiate(chosen.env.get("place")),
         settings=settings,
     )
 
@@ -53,6 +52,6 @@ def main(config: DictConfig) -> None:
     draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
     if draw is not None:
         draw(report, folder / "audit.png")
-    sys.stdout.write(f"{as_text(report)}\n{folder}\n")
+    sys.stdout.write(f"{report}\n{folder}\n")
     if report.flaws:
         sys.exit(FLAWS_FOUND)

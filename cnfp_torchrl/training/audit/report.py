@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.training.audit.table import as_text
 
 TOGETHER = "together"
 """The name under which the intersection of all constraints is reported."""
@@ -182,7 +183,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class AuditReport:
-    """Everything that an audit found.
+    """Everything that an audit found; as a string, tables and the verdict.
 
     Args:
         subject: what was audited: flow, order, policy, how actions were judged, settings.
@@ -202,6 +203,9 @@ class AuditReport:
     notes: tuple[str, ...] = ()
     strict: bool = False
     scenes: tuple[Scene, ...] = field(default=(), repr=False)
+
+    def __str__(self) -> str:
+        return as_text(self)
 
     @property
     def flaws(self) -> list[str]:

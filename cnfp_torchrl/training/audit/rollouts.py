@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.training.audit.probes import Reader
 from cnfp_torchrl.training.audit.states import bare, difference
+from cnfp_torchrl.training.evaluation import Policy
 
 
 class Record(NamedTuple):
@@ -30,7 +30,7 @@ class Record(NamedTuple):
 
 
 def roll_out(
-    env: EnvBase, policy: TensorDictModuleBase, reader: Reader, *, steps: int, copies: int = 0
+    env: EnvBase, policy: Policy, reader: Reader, *, steps: int, copies: int = 0
 ) -> Record:
     """Let a policy act, and keep every state.
 
@@ -90,4 +90,7 @@ def _expected(env: EnvBase) -> str:
     return f"env: expected one that can be copied, to try many actions in one state, given {name}"
 
 
-_PLACE = "pass place, a function that puts the environment into given states"
+_PLACE = (
+    "give place (in a configuration env.place), a function that puts the environment into given "
+    "states, see docs/own_environment.md"
+)

@@ -14,11 +14,11 @@ from cnfp_torchrl.envs.cost import COST_KEY
 from cnfp_torchrl.envs.point_nav_geometry import read_observation
 
 Place = Callable[[EnvBase, TensorDictBase], TensorDictBase]
-"""``(env, states) -> reset``: put an environment into states of its own batch size.
+"""``(env, states) -> shown``: put an environment into states, and return what it then shows.
 
-To judge actions it is called with the environment without its transforms, and states that the
-environment showed before; to draw uniform states, with the whole environment. It resets the one
-that it is given and returns what the reset returned.
+It is given the environment without its transforms, and states of its batch size with the entries
+of its observation spec: such as it showed before, and drawn ones. What it returns needs no more
+than these entries, read from the environment anew: it is checked that they are those of the states.
 """
 
 LARGEST_ENTRY = 64
@@ -55,8 +55,10 @@ def uniform_states(env: EnvBase, place: Place, count: int) -> TensorDictBase:
     """Return states ``(count,)`` drawn from the observation spec, as the environment shows them."""
     found: list[TensorDictBase] = []
     while sum(map(len, found)) < count:
-        drawn = bare(env).observation_spec.rand()
-        found.append(place(env, drawn).reshape(-1))
+        shown = place(bare(env), bare(env).observation_spec.rand())
+        if isinstance(env, TransformedEnv):
+            shown = env.transform._reset(shown.empty(), shown)
+        found.append(shown.reshape(-1))
     return torch.cat(found)[:count]
 
 

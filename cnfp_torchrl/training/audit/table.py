@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from cnfp_torchrl.training.audit.report import AuditReport, Findings, Quantiles, Share
+if TYPE_CHECKING:  # the report is told by this module
+    from cnfp_torchrl.training.audit.report import AuditReport, Findings, Quantiles, Share
 
 _HEADER = (
     "states",
