@@ -172,6 +172,15 @@ def test_dropped_states_are_counted(reports: Callable[..., AuditReport]) -> None
     assert found.volume["min"] > 0.2
 
 
+def test_a_set_that_never_holds_is_a_flaw(reports: Callable[..., AuditReport]) -> None:
+    """It is not unsound, and all violations happen while it is dropped."""
+    report = reports(0.8, 2.0)
+    (flaw,) = report.flaws
+    states = sum(of(report, source).dropped.of for source in ("rollouts", "uniform"))
+    assert flaw.startswith(f"disc: dropped in all of {states} states, in {states} of which")
+    assert not any("dropped in all" in flaw for flaw in reports(0.8, 0.7).flaws)
+
+
 def test_dead_ends_are_flaws_where_that_is_asked_for() -> None:
     env = with_geometry(Disc(256), Share_(0.9, 0.7))
     indicators = {"disc": lambda before, after: torch.zeros(256, dtype=torch.bool)}

@@ -209,7 +209,10 @@ class AuditReport:
 
     @property
     def flaws(self) -> list[str]:
-        """What must not be: unsound sets, a flow that leaves them, ways into a violation."""
+        """What must not be.
+
+        Unsound sets, sets that never hold, a flow that leaves its sets, ways into a violation.
+        """
         return list(self._flaws())
 
     def _flaws(self) -> Iterator[str]:
@@ -217,11 +220,25 @@ class AuditReport:
             *single, together = (self._flaws_of(each, source) for each in findings)
             # All together fail where one does: told once.
             yield from [flaw for flaws in single for flaw in flaws] or together
+        yield from self._never_active()
         for name, count in self.executed.led_into.items():
             if count:
                 yield (
                     f"{name}, rollouts: the policy was led into {count} violations from states in "
                     f"which the constraint was active, in {self.executed.steps} steps"
+                )
+
+    def _never_active(self) -> Iterator[str]:
+        for name in self.order:
+            found = [each for many in self.sources.values() for each in many if each.name == name]
+            states = sum(each.dropped.of for each in found)
+            if states > sum(each.dropped.count for each in found):
+                continue
+            possible = sum(each.possible.count for each in found if each.possible is not None)
+            if possible:
+                yield (
+                    f"{name}: dropped in all of {states} states, in {possible} of which its "
+                    "indicator allows an action"
                 )
 
     def _flaws_of(self, found: Findings, source: str) -> list[str]:
