@@ -107,7 +107,7 @@ def chebyshev_centre(
         GeometryError: when the first set is no finite box, or a field has NaN in it.
         RuntimeError: when the search does not come to an end.
     """
-    wide = [each.with_fields(lambda field, _: field.double()) for each in sets]
+    wide = [each.to(torch.float64) for each in sets]
     bounds = wide[0]
     if not isinstance(bounds, Box) or not bool((bounds.high - bounds.low).isfinite().all()):
         raise GeometryError("sets[0]: expected a finite Box of action bounds")

@@ -120,7 +120,7 @@ class ConstraintSet(ABC):
         The arithmetic is done in float64 whatever the dtype, so that the answer concerns the given
         numbers and not the rounding of the test.
         """
-        return self.with_fields(lambda field, _: field.double()).slack(action.double()) >= 0
+        return self.to(torch.float64).slack(action.double()) >= 0
 
     def bounding_box(self) -> Box:
         """Return a box around the set; its bounds are infinite where none are known."""

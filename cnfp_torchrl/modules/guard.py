@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -39,7 +40,7 @@ def refuse_violations(names: Sequence[str], region: Region, action: Tensor) -> N
         if bool(bad.any()):
             index = tuple(int(i) for i in bad.nonzero()[0])
             # In float64, as `contains`: in float32 the slack may round to 0.
-            exact = each.with_fields(lambda field, _: field.double())
+            exact = each.to(torch.float64)
             slack = float(exact.slack(action.double())[index])
             raise ConstraintViolationError(
                 f"constraint '{name}': expected an action inside its set, given "

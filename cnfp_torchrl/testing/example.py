@@ -88,8 +88,8 @@ class Example:
 
     def cast(self, dtype: torch.dtype) -> tuple[Box, ConstraintSet]:
         """Return bounds and sets in a dtype."""
-        bounds = self.bounds.with_fields(lambda field, _: field.to(dtype))
-        return bounds, self.sets.with_fields(lambda field, _: field.to(dtype))
+        bounds = self.bounds.to(dtype)
+        return bounds, self.sets.to(dtype)
 
     def normal(self, *shape: int) -> Tensor:
         """Return standard normal numbers in float64."""
@@ -129,10 +129,10 @@ class Example:
         gauge that subtracts large numbers is worst.
         """
         given = self.views[0].centre
-        twice = [each.with_fields(lambda f, _: f.float()) for each in (self.bounds, self.sets)]
+        twice = [each.to(torch.float32) for each in (self.bounds, self.sets)]
         magnitude = twice[0].bounding_box().magnitude()
         twice = [each.eroded(magnitude).eroded(magnitude) for each in twice]
-        twice = [each.with_fields(lambda field, _: field.double()) for each in twice]
+        twice = [each.to(torch.float64) for each in twice]
         views = [self.views[0]]
         for way in self.ways(4):
             gauge = torch.maximum(*(each.gauge(way, given) for each in twice)).unsqueeze(-1)

@@ -22,7 +22,7 @@ def check_erosion_covers_rounding(example: Example) -> None:
     # In float32, whose rounding errors float64 can tell from those of its own gauges.
     eps = ROUNDING_IN_EPS * torch.finfo(torch.float32).eps
     sets = example.cast(torch.float32)[1]
-    eroded = sets.eroded(example.size.float()).with_fields(lambda field, _: field.double())
+    eroded = sets.eroded(example.size.float()).to(torch.float64)
     for view in example.views:
         gauge = eroded.gauge(view.ways, view.centre)
         action = view.at(gauge.clamp(min=1)).requires_grad_()
@@ -40,7 +40,7 @@ def check_erosion_is_small(example: Example) -> None:
     """No more is taken away than rounding error of numbers of the actions' size, many times."""
     for dtype in DTYPES:
         sets = example.cast(dtype)[1]
-        eroded = sets.eroded(example.size.to(dtype)).with_fields(lambda field, _: field.double())
+        eroded = sets.eroded(example.size.to(dtype)).to(torch.float64)
         most = LARGEST_EROSION_IN_EPS * torch.finfo(dtype).eps * example.size
         for view in example.views:
             gauge = eroded.gauge(view.ways, view.centre)

@@ -74,7 +74,7 @@ def check_gauge_in_float32(example: Example) -> None:
     """
     wide = example.sets
     sets = example.cast(torch.float32)[1]
-    eroded = sets.eroded(example.size.float()).with_fields(lambda field, _: field.double())
+    eroded = sets.eroded(example.size.float()).to(torch.float64)
     for view in example.views:
         single = view.cast(torch.float32)
         gauge = sets.gauge(single.ways, single.centre).double()

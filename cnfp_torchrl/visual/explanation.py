@@ -100,7 +100,7 @@ def _effect(
         share_moved=share_moved,
         share_outside=_share(~contained),
         share_allowed=share_allowed,
-        slack=float(allowed.with_fields(lambda field, _: field.double()).slack(action.double())),
+        slack=float(allowed.to(torch.float64).slack(action.double())),
         fact=fact,
     )
 

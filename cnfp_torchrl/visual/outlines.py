@@ -39,7 +39,7 @@ def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> li
     x = torch.linspace(x_low, x_high, nodes or _GRID, dtype=torch.float64)
     y = torch.linspace(y_low, y_high, nodes or _GRID, dtype=torch.float64)
     actions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    slack = each.with_fields(lambda value, _: value.double()).slack(actions)
+    slack = each.to(torch.float64).slack(actions)
     # A slack may be infinite; a contour needs numbers on both sides of it.
     slack = slack.nan_to_num(nan=-1e6, posinf=1e6, neginf=-1e6)
     contours = contourpy.contour_generator(x.numpy(), y.numpy(), slack.numpy())
@@ -86,7 +86,7 @@ def shadow_gauge(region: Region, applied: Sequence[int], ray: Tensor) -> Tensor:
         ray: directions in the first m <= d components, ``(rays, m)``.
     """
     sets = [
-        region.sets[k].with_fields(lambda value, _: value.double())
+        region.sets[k].to(torch.float64)
         for k in applied
         if region.active is None or bool(region.active[k])
     ]

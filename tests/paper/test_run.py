@@ -109,11 +109,12 @@ def test_signals_stop_the_runs(
     thread = threading.Thread(target=interrupt)
     thread.start()
     jobs = [Job("exact", seed, 64) for seed in range(3)]
+    before = signal.getsignal(number)
     with pytest.raises(run.Stopped, match=str(int(number))), run.signals_noted() as signals:
         run.run_jobs(jobs, tmp_path, tmp_path, parallel=2, progress=Told(), signals=signals)
     thread.join()
     assert [process.poll() for process in started] == [-signal.SIGTERM] * 2
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(number) is before
 
 
 def test_two_commands_do_not_share_a_folder(tmp_path: Path) -> None:
