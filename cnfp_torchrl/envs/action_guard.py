@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import dropwhile
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.centre import constraint_bijectors
+from cnfp_torchrl.envs.centre import ConstraintCentre, constraint_bijectors
+from cnfp_torchrl.envs.geometry_transform import appended_transforms
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, require
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.guard import refuse_violations
@@ -18,15 +21,20 @@ class ActionGuard(Transform):
 
     Whoever chose it: an actor, ``env.rand_action``, a collector's ``init_random_frames``. The check
     is that of `cnfp_torchrl.modules.ExecutedActionGuard`, with zero tolerance, and never repairs.
-    Append it to an environment that publishes its constraints, after all that changes actions::
+    Append it right after the constraints: what is appended behind it, and changes actions, does so
+    before it sees them::
 
         env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
         env.append_transform(ActionGuard())
 
+    One step is one action in one state: a transform that repeats actions in states that nobody
+    sees, such as `torchrl.envs.FrameSkipTransform`, belongs into the environment that is
+    constrained, whose geometry must then hold for all of these steps.
     `torchrl.envs.check_env_specs` acts at random: call it before.
 
     Raises:
-        ValueError: when the environment publishes no constraint or no centre.
+        ValueError: when the environment publishes no constraint or no centre, or changes actions
+            between its constraints and the guard.
         ConstraintViolationError: at a step, naming constraint, batch index, action and slack.
     """
 
@@ -62,6 +70,16 @@ class ActionGuard(Transform):
         input_spec["full_state_spec"] = state_spec
         return input_spec
 
+    def _refuse_changed_actions(self) -> None:
+        transforms = appended_transforms(self.parent)
+        for each in dropwhile(lambda each: not isinstance(each, ConstraintCentre), transforms):
+            if self.parent.action_key in each.in_keys_inv:
+                raise ValueError(
+                    "ActionGuard: expected to be appended before transforms that change actions, "
+                    f"given one behind {type(each).__name__}, which would change them after the "
+                    "check; append it right after constrain_env"
+                )
+
     def _flow_head(self) -> ConstrainedFlowModule:
         if self._head is None:
             if self.parent is None:
@@ -69,6 +87,7 @@ class ActionGuard(Transform):
                     "ActionGuard: expected to be part of an environment, which knows the "
                     "constraints, before use; append it with env.append_transform"
                 )
+            self._refuse_changed_actions()
             self._head = ConstrainedFlowModule(
                 self.parent.action_spec_unbatched,
                 constraint_bijectors(self.parent),

@@ -68,19 +68,29 @@ def constrain_env(
             None takes the order of the geometries. ``constraint_bijectors(env)`` keeps it.
 
     Raises:
-        TypeError: when a geometry is none, such as a class or a list, or the order is a string.
+        TypeError: when the environment or a geometry is none, such as a class or a list, or when
+            the order is a string.
         ValueError: without geometries, or when an order does not name each constraint once.
     """
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env: expected a TorchRL environment, given {_kind(env)}; wrap one of Gymnasium's in "
+            "torchrl.envs.GymWrapper"
+        )
     if not geometries:
         raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
     for each in geometries:
         if not isinstance(each, GeometryTransform):
-            kind = f"the class {each.__name__}" if isinstance(each, type) else type(each).__name__
             raise TypeError(
-                f"geometries: expected each to be a GeometryTransform, given {kind}; {_EXAMPLE}"
+                f"geometries: expected each to be a GeometryTransform, given {_kind(each)}; "
+                f"{_EXAMPLE}"
             )
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
     return published.append_transform(ConstraintCentre(_published(published), order))
+
+
+def _kind(given: object) -> str:
+    return f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
 
 
 def _published(env: EnvBase) -> list[ConstraintBijector]:

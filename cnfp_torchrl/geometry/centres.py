@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ def lexicographic_centre(
     :math:`S = A_0`; for k from the highest priority K down to 1: if S and :math:`A_k` have a common
     point with the minimum slack, :math:`S = S \cap A_k`, else :math:`A_k` is inactive in this
     state. A convex set is dropped only on a certified upper bound of the slack below the minimum.
-    Of non-convex sets convex parts are tried: those of the most room, those near a point that all
+    Of non-convex sets convex parts are tried: those of the most room, those near points that all
     convex sets have in common, and those near a point of what is kept so far. Slack is counted in
     sets eroded for rounding error twice: once for the actions, once for the centre.
 
@@ -171,8 +171,10 @@ def _common_point(
     if all(convex) or bool(fits.all()):
         return point, fits
     of_convex = active & torch.tensor(convex, device=active.device)
-    for near in (chebyshev_centre(sets, of_convex, minimum_slack).action, kept):
-        index = (~fits).nonzero().squeeze(-1)
+    relaxed = chebyshev_centre(sets, of_convex, minimum_slack)
+    possible = relaxed.upper_bound >= minimum_slack
+    for near in (relaxed.action, kept, *_around(relaxed.action, sets, of_convex)):
+        index = (possible & ~fits).nonzero().squeeze(-1)
         if not len(index):
             break
         hard = [each.select(fits.shape, index) for each in sets]
@@ -180,6 +182,15 @@ def _common_point(
         point = point.index_copy(0, index, best.action)
         fits = fits.index_copy(0, index, best.upper_bound >= minimum_slack)
     return point, fits
+
+
+def _around(point: Tensor, sets: Sequence[ConstraintSet], active: Tensor) -> Iterator[Tensor]:
+    """Yield points ``(B, d)`` half of the way out of all active sets, along each axis."""
+    for axis in torch.eye(point.shape[-1], dtype=point.dtype, device=point.device):
+        for way in (axis.expand_as(point), -axis.expand_as(point)):
+            gauges = torch.stack([each.to(point.dtype).gauge(way, point) for each in sets], -1)
+            gauge = torch.where(active, gauges, 0.0).amax(-1, keepdim=True)
+            yield point + way * (0.5 / gauge)
 
 
 def _from_candidate(

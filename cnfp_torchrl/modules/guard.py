@@ -41,7 +41,7 @@ def refuse_violations(names: Sequence[str], region: Region, action: Tensor) -> N
             index = tuple(int(i) for i in bad.nonzero()[0])
             # In float64, as `contains`: in float32 the slack may round to 0.
             exact = each.to(torch.float64)
-            slack = float(exact.slack(action.double())[index])
+            slack = exact.slack(action.double())[index].item()
             raise ConstraintViolationError(
                 f"constraint '{name}': expected an action inside its set, given "
                 f"{action[index].tolist()} with slack {slack:.3g} at batch index {list(index)}"

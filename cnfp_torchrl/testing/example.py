@@ -167,8 +167,10 @@ def _bounds_about(sets: ConstraintSet, centre: Tensor, random: torch.Generator) 
     """Return bounds some times wider than the set is where it is narrow, not centred."""
     ways = torch.randn(32, *centre.shape, generator=random, dtype=torch.float64).to(centre)
     ways = ways / vector_norm(ways, dim=-1, keepdim=True)
-    length = sets.slack(centre).expand(ways.shape[:-1]).nan_to_num(1.0).clamp(1e-6, 1e6)
-    for _ in range(20):
+    slack = sets.slack(centre).nan_to_num(1.0, posinf=1.0)
+    length = slack.expand(ways.shape[:-1]).clamp(1e-6, 1e6)
+    # Not for ever: about a set that is open in most directions, bounds are a matter of taste.
+    for _ in range(6):
         inside = sets.contains(centre + length.unsqueeze(-1) * ways)
         length = torch.where(inside, 2 * length, length)
     half = length.amin(0).unsqueeze(-1)

@@ -59,6 +59,10 @@ COUNTS = Expected("a list of whole numbers >= 1", lambda x: _is_list(x) and all(
 COSTS = Expected(
     "a list of finite numbers >= 0", lambda x: _is_list(x) and all(map(NOT_NEGATIVE.fits, x))
 )
+NAMES = Expected(
+    "a list of names such as [battery, obstacle]",
+    lambda x: _is_list(x) and all(isinstance(each, str) for each in x),
+)
 PAIRS = Expected("a list of pairs such as [[0, 1]], or null", lambda x: x is None or _is_list(x))
 FREE_OR_PORT = Expected(f"{PORT.words}, or null", lambda x: x is None or PORT.fits(x))
 
@@ -68,6 +72,7 @@ _EXPECTED = {
     "batch": COUNT,
     "env.agents": COUNT,
     "env.penalty.penalty": POSITIVE,
+    "flow.order": NAMES,
     "flow.combine.max_radius": RADIUS,
     "network.hidden": COUNTS,
     "loss.gamma": DISCOUNT,

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import (
+    ActionScaling,
     Compose,
     EnvBase,
     GymEnv,
@@ -165,3 +166,16 @@ def test_what_it_needs_is_said() -> None:
         env.transform.inv(state)
     with pytest.raises(RuntimeError, match="expected to be part of an environment"):
         ActionGuard().inv(state.set("action", torch.zeros(3, 2)))
+
+
+def test_it_must_see_what_is_executed() -> None:
+    """Inverse transforms run from the last to the first: one behind the guard acts before it."""
+    scaling = ActionScaling(loc=torch.full((2,), 0.3), scale=torch.full((2,), 0.7))
+    env = constrained(16).append_transform(scaling).append_transform(ActionGuard())
+    with pytest.raises(ValueError, match=r"given one behind ActionScaling.*right after constrain"):
+        env.rollout(1)
+    env = constrained(16)
+    actor = untrained_actor(env)
+    env.append_transform(ActionGuard()).append_transform(scaling.clone())
+    with pytest.raises(ConstraintViolationError):
+        env.rollout(200, actor, break_when_any_done=False)

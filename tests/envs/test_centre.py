@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -452,3 +453,9 @@ def test_constrain_env_needs_a_geometry_and_a_list_for_an_order() -> None:
         constrain_env(PointNavEnv([2]))
     with pytest.raises(TypeError, match=r"order: .*given the string 'battery'"):
         constrain_env(PointNavEnv([2]), BatteryGeometry(), order="battery")
+
+
+@pytest.mark.parametrize("wrong", [PointNavEnv, gymnasium.make("Pendulum-v1")])
+def test_what_is_no_environment_is_refused(wrong: object) -> None:
+    with pytest.raises(TypeError, match=r"env: expected a TorchRL environment, given .*GymWrapper"):
+        constrain_env(wrong, BatteryGeometry())  # type: ignore[arg-type]

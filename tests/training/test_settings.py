@@ -16,6 +16,7 @@ REFUSED = {
     "seed": (WHOLE, ["-3", "abc", "null", "1.5", "true"]),
     "threads": (COUNT, ["0", "abc", "null"]),
     "env.agents": (COUNT, ["0", "abc", "true"]),
+    "flow.order": ("a list of names", ["battery", "[0,1]", "null"]),
     "env.score.zero": ("a finite number", ["abc", "null", "nan", "inf"]),
     "env.score.one": ("another return than env.score.zero", ["-104.0"]),
     "network.hidden": ("a list of whole numbers >= 1", ["64", "[0]", "[64,wide]"]),
