@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -162,7 +163,7 @@ def _common_point(
     Args:
         sets: the first are the action bounds.
         active: boolean ``(B, len(sets))``.
-        kept: points of all active sets but the last one, ``(B, d)``.
+        kept: points of the sets that are kept so far, ``(B, d)``.
         minimum_slack: of the points.
     """
     best = chebyshev_centre(sets, active, minimum_slack)
@@ -173,7 +174,8 @@ def _common_point(
     of_convex = active & torch.tensor(convex, device=active.device)
     relaxed = chebyshev_centre(sets, of_convex, minimum_slack)
     possible = relaxed.upper_bound >= minimum_slack
-    for near in (relaxed.action, kept, *_around(relaxed.action, sets, of_convex)):
+    around = _around(relaxed.action, sets, of_convex)
+    for near in chain((relaxed.action, kept), around):
         index = (possible & ~fits).nonzero().squeeze(-1)
         if not len(index):
             break
@@ -185,7 +187,7 @@ def _common_point(
 
 
 def _around(point: Tensor, sets: Sequence[ConstraintSet], active: Tensor) -> Iterator[Tensor]:
-    """Yield points ``(B, d)`` half of the way out of all active sets, along each axis."""
+    """Yield points ``(B, d)`` half of the way out of the active sets, along each axis."""
     for axis in torch.eye(point.shape[-1], dtype=point.dtype, device=point.device):
         for way in (axis.expand_as(point), -axis.expand_as(point)):
             gauges = torch.stack([each.to(point.dtype).gauge(way, point) for each in sets], -1)
