@@ -129,22 +129,27 @@ class _Retraction:
 
     def inverse(self, action: Tensor) -> Tensor:
         """Return the offset of an action."""
-        return self.inverse_and_log_det(action)[0]
+        return self._offset_and_contraction(action)[0]
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the offset of an action, and the log-determinant of the way back to it."""
+        offset, contraction = self._offset_and_contraction(action)
+        log_det = torch.zeros_like(offset[..., 0])
+        if contraction is not None:
+            log_det = offset.shape[-1] * contraction.log()
+        if self._scale is not None:
+            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
+        return offset, log_det
+
+    def _offset_and_contraction(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         offset = action - self._centre
         if self._scale is not None:
             offset = self._scale.inverse(offset)
         # It depends on the direction alone, as the component scale does.
         _, contraction = self._scaled_and_contraction(offset)
-        log_det = torch.zeros_like(offset[..., 0])
         if contraction is not None:
             offset = offset * contraction.unsqueeze(-1)
-            log_det = offset.shape[-1] * contraction.log()
-        if self._scale is not None:
-            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
-        return offset, log_det
+        return offset, contraction
 
     def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the offset after the boxes, and by what it is to be divided for other sets."""

@@ -96,17 +96,11 @@ class VisibleRegion(ConstraintSet):
         [l, h] in action units: a maximum over pairs of lines in tau, one rising, one falling, of
         where they cross, and over rising lines at tau = 1. Minus infinity inside a rectangle.
         """
-        low, high = self._in_action_units()
+        slope, rising, pair = self._lines()
         action = action.unsqueeze(-2)
-        slope = torch.cat([low, -high], -1)
-        finite = slope.isfinite()
-        slope = torch.where(finite, slope, 0.0)
         start = torch.cat([-action, action], -1)
-        start, slope, finite = torch.broadcast_tensors(start, slope, finite)
-        rising = finite & (slope >= 0)
         at_one = torch.where(rising, slope + start, -torch.inf).amax(-1)
         j, k = slope.unsqueeze(-1), slope.unsqueeze(-2)
-        pair = (finite & (slope > 0)).unsqueeze(-1) & (finite & (slope < 0)).unsqueeze(-2)
         crossing = (j * start.unsqueeze(-2) - k * start.unsqueeze(-1)) / torch.where(pair, j - k, 1)
         crossing = torch.where(pair, crossing, -torch.inf).amax((-2, -1))
         return torch.maximum(at_one, crossing).amin(-1)
@@ -178,20 +172,16 @@ class VisibleRegion(ConstraintSet):
         What a rectangle leaves is a union of half-spaces, the lines of `slack`: this side of it, or
         past a corner of it on the side away from its shadow. One is taken for each rectangle.
         """
-        low, high = self._in_action_units()
-        identity = torch.eye(self.dim, dtype=low.dtype, device=low.device)
-        # Lines in tau: slope tau - normal . a, of which the largest at some tau >= 1 is the slack.
-        slope, normals = torch.cat([low, -high], -1), torch.cat([identity, -identity])
-        finite = slope.isfinite()
-        slope = torch.where(finite, slope, 0.0)
+        slope, rising, pair = self._lines()
+        identity = torch.eye(self.dim, dtype=slope.dtype, device=slope.device)
+        normals = torch.cat([identity, -identity])
         j, k = slope.unsqueeze(-1), slope.unsqueeze(-2)
-        pair = (finite & (slope > 0)).unsqueeze(-1) & (finite & (slope < 0)).unsqueeze(-2)
         share = torch.where(pair, j / torch.where(pair, j - k, 1), 0.0).unsqueeze(-1)
         crossing = share * normals + (1 - share) * normals.unsqueeze(-2)
         # All half-spaces, normal . a + t <= offset.
         normals = torch.cat([normals.expand(*slope.shape, -1), crossing.flatten(-3, -2)], -2)
         offsets = torch.cat([slope, torch.zeros_like(pair.flatten(-2), dtype=slope.dtype)], -1)
-        valid = torch.cat([finite & (slope >= 0), pair.flatten(-2)], -1)
+        valid = torch.cat([rising, pair.flatten(-2)], -1)
         slack = offsets - (normals * point[..., None, None, :]).sum(-1)
         best = torch.where(valid, slack, -torch.inf).argmax(-1, keepdim=True)
         normal = normals.take_along_dim(best.unsqueeze(-1), -2).squeeze(-2)
@@ -201,6 +191,19 @@ class VisibleRegion(ConstraintSet):
         normal = torch.where(outside.unsqueeze(-1), normal, 0.0)
         offset = torch.where(outside, offset, -1.0)
         return Rows(normal, offset, torch.ones_like(offset))
+
+    def _lines(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the slopes in tau of the lines of `slack`, which rise, and which pairs cross.
+
+        ``(*batch, m, 2d)`` twice, the low bounds' lines first, and ``(*batch, m, 2d, 2d)``: of a
+        pair the first one rises and the second one falls. Infinite bounds have no line.
+        """
+        low, high = self._in_action_units()
+        slope = torch.cat([low, -high], -1)
+        finite = slope.isfinite()
+        slope = torch.where(finite, slope, 0.0)
+        pair = (finite & (slope > 0)).unsqueeze(-1) & (finite & (slope < 0)).unsqueeze(-2)
+        return slope, finite & (slope >= 0), pair
 
     def _in_action_units(self) -> tuple[Tensor, Tensor]:
         """Return the rectangles' corners as seen from the position, each ``(*batch, m, d)``."""

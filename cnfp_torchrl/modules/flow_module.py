@@ -158,13 +158,13 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
-        loc, scale = (self.as_fine(tensordict.get(key)) for key in self.parameter_keys)
+        loc, scale = (self.widened(tensordict.get(key)) for key in self.parameter_keys)
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
         return self.distribution_type(base, self.get_bijector(tensordict))
 
     build_dist_from_params = get_dist
 
-    def as_fine(self, value: Tensor) -> Tensor:
+    def widened(self, value: Tensor) -> Tensor:
         """Return a latent or its parameter, in the action spec's dtype if its own is coarser."""
         if value.dtype == torch.float32:
             return value.to(self.action_dtype)

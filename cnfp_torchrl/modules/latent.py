@@ -68,7 +68,7 @@ class FlowMap(TensorDictModuleBase):
                 f"components, as the action has, given shape {tuple(latent.shape)}"
             )
         bijector = self.head.get_bijector(tensordict)
-        return tensordict.set(self.head.action_key, bijector(self.head.as_fine(latent)))
+        return tensordict.set(self.head.action_key, bijector(self.head.widened(latent)))
 
 
 class LatentGaussian(IndependentNormal):
