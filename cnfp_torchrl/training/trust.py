@@ -253,7 +253,7 @@ class _Check:
         if _home(found) in nameable():
             return False
         if inspect.isclass(found) or (inspect.isroutine(found) and not isinstance(found, partial)):
-            is_defined = _top(str(found.__module__)) == _top(target)
+            is_defined = _top(str(getattr(found, "__module__", None))) == _top(target)
         else:
             # Such as a functools.partial: its home is the module that it stands in.
             is_defined = isinstance(locate(target.rpartition(".")[0]), ModuleType)
