@@ -118,8 +118,8 @@ import torch
 from os import system
 from torch import load
 from torchrl.envs import GymEnv
-from cnfp_torchrl.envs import PointNavEnv
-from cnfp_torchrl.envs import Layout as Map
+from cnfp_torchrl.tasks.point_nav import Layout as Map
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 
 class Env:
     @classmethod
@@ -134,20 +134,10 @@ make_other = functools.partial(make_env, [3])
 @functools.lru_cache
 def make_cached(): ...
 """
-OWN_NAMES = set(
-    [
-        "Env",
-        "Env.make",
-        "OwnPath",
-        "make_env",
-        "make_other",
-        "make_other.func",
-        "make_cached",
-        "GymEnv",
-        "PointNavEnv",
-        "Map",
-    ]
-)
+OWN_NAMES = {
+    *("Env", "Env.make", "OwnPath", "make_env", "make_other", "make_other.func", "make_cached"),
+    *("GymEnv", "PointNavEnv", "Map"),
+}
 
 
 @pytest.fixture
@@ -197,13 +187,13 @@ def test_arguments_of_trusted_targets_are_the_readers_own(own_package: str) -> N
 
 
 GYM = {"_target_": "torchrl.envs.GymEnv"}
-HERE = {"_target_": "cnfp_torchrl.envs.Layout"}
+HERE = {"_target_": "cnfp_torchrl.tasks.point_nav.Layout"}
 REFUSED: dict[str, tuple[Any, str]] = {
     "a foreign function": ({"_target_": "os.system", "command": "true"}, "os.system"),
     "an attribute hop": ({"_target_": CALL, "f": "evil.pt", "weights_only": False}, CALL),
     "a function of ours that acts": ({"_target_": "cnfp_torchrl.visual.draw_run_figures"}, "draw"),
     "our own reader": ({"_target_": "cnfp_torchrl.training.run_folder.RunFolder"}, "RunFolder"),
-    "a method": ({"_target_": "cnfp_torchrl.envs.PointNavEnv.rollout"}, "rollout"),
+    "a method": ({"_target_": "cnfp_torchrl.tasks.point_nav.PointNavEnv.rollout"}, "rollout"),
     "a similar name": ({"_target_": "cnfp_torchrl_evil.run"}, "cnfp_torchrl_evil"),
     "in a list": ({"deep": [{"x": [{"_target_": "torch.load"}]}]}, r"deep\[0\].x\[0\]._target_"),
     "as an argument": (HERE | {"rectangles": {"_target_": "os.system"}}, "rectangles._target_"),
