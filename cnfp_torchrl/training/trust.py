@@ -55,6 +55,10 @@ _TEXTS = {
 """What a text may be as an argument of this name; any other has to be `_WORDS`."""
 
 
+class DetourError(ValueError):
+    """A dotted name leaves its package through a module that it imports."""
+
+
 def read_plain(path: Path) -> dict[str, Any]:
     """Return the content of a YAML file as plain data: nothing is resolved, made or imported.
 
@@ -62,14 +66,15 @@ def read_plain(path: Path) -> dict[str, Any]:
         ValueError: when it is no YAML, has a tag or an alias, or is no mapping.
     """
     expected = f"{path}: expected the plain YAML mapping that a training run writes"
+    remedy = "copy the file anew from where the run was trained"
     try:
         text = path.read_text(encoding="utf-8")
         odd = next(_tags_and_aliases(text), None)
         content = None if odd else OmegaConf.to_container(OmegaConf.create(text))
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
-        raise ValueError(f"{expected}, given something else: {error}") from error
+        raise ValueError(f"{expected}, given something else: {error}; {remedy}") from error
     if odd or not isinstance(content, dict):
-        raise ValueError(f"{expected}, given {odd or type(content).__name__}")
+        raise ValueError(f"{expected}, given {odd or type(content).__name__}; {remedy}")
     return {str(name): each for name, each in content.items()}
 
 
@@ -121,7 +126,7 @@ def locate(name: str) -> Any:
     """Return what a dotted name means, imported as Hydra does, without leaving a package.
 
     Raises:
-        LookupError: when the name leads through a module under another name than its own.
+        DetourError: when the name leads through a module under another name than its own.
         ImportError: when there is nothing of this name.
     """
     first, *rest = name.split(".")
@@ -129,7 +134,7 @@ def locate(name: str) -> Any:
     reached = first
     for part in rest:
         if isinstance(found, ModuleType) and found.__name__ != reached:
-            raise LookupError(f"{reached} is the module {found.__name__}")
+            raise DetourError(f"{reached} is the module {found.__name__}")
         is_module, reached = isinstance(found, ModuleType), f"{reached}.{part}"
         try:
             found = getattr(found, part)
@@ -182,12 +187,10 @@ class _Check:
         self.path, self.trusted = path, trusted
 
     def refuse(self, place: str, expected: str, given: Any) -> NoReturn:
-        known = ", ".join(("cnfp_torchrl", *FOREIGN, *self.trusted))
         raise PermissionError(
             f"{self.path}, {place.lstrip('.')}: expected {expected}, given {given!r}; nothing of "
-            f"the run was executed. Trusted are {known}: if you trust whoever wrote this run, name "
-            "the package that defines what it needs: trusted=[my_package.] (cnfp-explain: "
-            "--trusted my_package.)"
+            "the run was executed. If you trust whoever wrote it, name the package that defines "
+            "what it needs: trusted=[my_package.] (cnfp-explain: --trusted my_package.)"
         )
 
     def walk(self, content: Any, place: str, name: str, *, is_limited: bool) -> None:
@@ -238,14 +241,15 @@ class _Check:
                 return self.require_defined(target, place)
             if target in nameable():
                 return False
-        self.refuse(place, "a target of the shipped kinds (env, flow, network, evaluation)", target)
+        which = " or ".join([*FOREIGN, *(f"what is defined in {each}" for each in self.trusted)])
+        self.refuse(place, f"a target that the shipped configuration names, {which}", target)
 
     def require_defined(self, target: str, place: str) -> bool:
         """Refuse a name in a trusted package of something that is not defined there."""
         expected = f"a class or function that is defined in {_top(target)}"
         try:
             found = locate(target)
-        except LookupError as error:
+        except DetourError as error:
             self.refuse(place, f"{expected} (but {error})", target)
         except ImportError:
             # There is nothing to execute: Hydra will say that it cannot be found.
