@@ -7,7 +7,7 @@ import json
 import os
 import pickle
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,16 @@ class RunFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self._release: Callable[[], Any] | None = None
+
+    def close(self) -> None:
+        """Let go of the folder; a run that has started keeps it by its configuration."""
+        if self._release is not None:
+            self._release()
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
-        """Return a new run's folder, made if need be and held until this object is gone.
+        """Return a new run's folder, made if need be and held until closed, or gone.
 
         Raises:
             FileExistsError: when the folder holds a run already, or another process holds it.
@@ -45,6 +51,7 @@ class RunFolder:
         if not folder._hold():
             raise FileExistsError(f"{expected}, but another run works in {folder.path}; {remedy}")
         if held := [n for n in (CONFIG, CHECKPOINT, SUMMARY) if (folder.path / n).exists()]:
+            folder.close()
             raise FileExistsError(
                 f"{expected}, but {folder.path} holds {held} of another; {remedy}"
             )
@@ -53,15 +60,15 @@ class RunFolder:
     def _hold(self) -> bool:
         """Lock the folder itself, which leaves nothing in it, and tell whether nobody else did."""
         handle = os.open(self.path, os.O_RDONLY)
-        release = weakref.finalize(self, os.close, handle)
+        self._release = weakref.finalize(self, os.close, handle)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            release()
+            self.close()
             return False
         except OSError:
             # Some network file systems cannot lock a folder: there `save_config` decides, later.
-            release()
+            self.close()
         return True
 
     @classmethod

@@ -53,6 +53,11 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     Raises:
         ValueError: before any work, for a setting that makes no sense.
     """
+    with closing(folder):
+        return _train(config, folder)
+
+
+def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     started = time.perf_counter()
     require_settings(config)
     settings: TrainingSettings = instantiate(config.training)

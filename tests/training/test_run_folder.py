@@ -45,8 +45,11 @@ def test_two_runs_at_once_never_share_a_folder(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"another run works in .*hydra\.run\.dir"):
         RunFolder.create(tmp_path / "run")
     assert not list(first.path.iterdir())
-    del first
-    assert RunFolder.create(tmp_path / "run")
+    first.close()
+    second = RunFolder.create(tmp_path / "run")
+    path = second.path
+    del second
+    assert RunFolder.create(path)
 
 
 def test_where_folders_cannot_be_locked_the_first_configuration_decides(tmp_path: Path) -> None:
