@@ -9,7 +9,9 @@ VENV := .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 CONSTRAINTS := .ci/constraints.txt
-NUMERIC := tests/bijectors tests/geometry tests/test_distributions.py tests/modules/test_latent.py
+# What torch.compile traces does not depend on the processor, and takes long.
+NUMERIC := $(filter-out %/test_compile.py,$(wildcard tests/bijectors/test_*.py tests/geometry/test_*.py)) \
+	tests/test_distributions.py tests/modules/test_latent.py
 
 .DEFAULT_GOAL := help
 .PHONY: help install train evaluate audit view explain test test-slow test-rounding bench paper figures check lint types format clean
