@@ -12,6 +12,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules.actors import flow_head
+from cnfp_torchrl.modules.flow_module import refuse_other_batch
 
 
 class ConstraintViolationError(RuntimeError):
@@ -24,13 +25,14 @@ def refuse_violations(names: Sequence[str], region: Region, action: Tensor) -> N
     The check has zero tolerance and is done in float64. Reads the action on the host.
 
     Args:
-        names: of the constraints, in the order of the region's sets behind the bounds.
-        region: of allowed actions.
-        action: as it will be executed, ``(*batch, d)``.
+        names: The constraints' names, in the order of the region's sets behind the bounds.
+        region: The region of allowed actions.
+        action: The action as it will be executed, ``(*batch, d)``.
 
     Raises:
         ConstraintViolationError: naming constraint, batch index, action and slack.
     """
+    refuse_other_batch("action", action, region.anchor.shape[:-1])
     if bool(region.contains(action).all()):
         return
     for stage, (name, each) in enumerate(zip(["bounds", *names], region.sets, strict=True)):
