@@ -6,11 +6,9 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.bijectors.ball_squash import squash_to_unit_ball
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
-from cnfp_torchrl.bijectors.hyperbolic import radial_log_det
-from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
-from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.bijectors.squashes import radial_log_det, squash_to_unit_ball
+from cnfp_torchrl.geometry import Region, scaled_direction
 
 
 class RadialSquash(Bijector):
@@ -32,7 +30,7 @@ class RadialSquash(Bijector):
 
     @property
     def shape(self) -> torch.Size:
-        return region_shape(self.region)
+        return self.region.shape
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         direction, _ = scaled_direction(latent)

@@ -7,11 +7,14 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.hyperbolic import log_sech_squared
-from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
-from cnfp_torchrl.geometry import GeometryError, Region
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.bijectors.squashes import log_sech_squared
+from cnfp_torchrl.geometry import (
+    EROSION_IN_EPS,
+    GeometryError,
+    Region,
+    broadcast_shape,
+    scaled_direction,
+)
 
 
 class ShellSquash(Bijector):
@@ -60,7 +63,7 @@ class ShellSquash(Bijector):
 
     @property
     def shape(self) -> torch.Size:
-        region = () if self._region is None else (region_shape(self._region)[:-1],)
+        region = () if self._region is None else (self._region.shape[:-1],)
         batch = broadcast_shape(self._center.shape[:-1], self._inner.shape, *region)
         return torch.Size((*batch, self._center.shape[-1]))
 

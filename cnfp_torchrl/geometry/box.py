@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Rows
 
 
@@ -44,8 +44,8 @@ class Box(ConstraintSet):
         above, below = self.high - anchor, anchor - self.low
         return partial(_gauge, above.reciprocal(), below.reciprocal())
 
-    def bounding_box(self) -> Box:
-        return self
+    def bounding_box(self) -> Bounds:
+        return Bounds(self.low, self.high)
 
     def magnitude(self) -> Tensor:
         """Return the largest coordinate of any point, ``(*batch,)``."""

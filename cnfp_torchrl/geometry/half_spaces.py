@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
 from cnfp_torchrl.geometry.superlevel import Rows
 
 
@@ -62,13 +61,13 @@ class HalfSpaces(ConstraintSet):
         room = self._offsets_and_lengths()[0] - _rows(self.normals, anchor)
         return partial(_gauge, self.normals, room.reciprocal())
 
-    def bounding_box(self) -> Box:
+    def bounding_box(self) -> Bounds:
         """Return the bounds that single rows with one component set; the others are infinite."""
         single = (self.normals != 0).sum(-1, keepdim=True) == 1
         bound = self.offsets.unsqueeze(-1) / self.normals
         high = torch.where(single & (self.normals > 0), bound, torch.inf).amin(-2)
         low = torch.where(single & (self.normals < 0), bound, -torch.inf).amax(-2)
-        return Box(low, high, validate_args=False)
+        return Bounds(low, high)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps

@@ -1,4 +1,4 @@
-"""Sums of kinked terms, a shared base: weighted L1 balls and bounds of positive parts."""
+"""Bounds of weighted sums: weighted L1 balls, and limits of positive parts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet
 from cnfp_torchrl.geometry.superlevel import KinkedSum
 
 
@@ -60,11 +59,11 @@ class KinkedSumBound(ConstraintSet):
         room = self.bound - (side * anchor).sum(-1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
-    def bounding_box(self) -> Box:
+    def bounding_box(self) -> Bounds:
         upper, lower = self.slopes(self.weights)
         bound = self.bound.unsqueeze(-1)
         # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
-        return Box(-bound / lower.abs(), bound / upper, validate_args=False)
+        return Bounds(-bound / lower.abs(), bound / upper)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # The sum is at most |center|_1 at the center, and grows at most by one each unit.
@@ -100,3 +99,48 @@ class KinkedSumBound(ConstraintSet):
 def _running(terms: Tensor, changes: Tensor) -> Tensor:
     """Return the sum of the terms, and after each change, ``(*batch, d + 1)``."""
     return torch.cat([terms.sum(-1, keepdim=True), changes], -1).cumsum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedL1Ball(KinkedSumBound):
+    r"""The weighted L1 ball :math:`\{a : \sum_i |weights_i a_i| \le bound\}`.
+
+    With joint velocities as weights and torques as actions it limits the power of all joints.
+
+    Args:
+        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
+        bound: ``(*batch,)``, positive and finite.
+    """
+
+    @staticmethod
+    def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
+        return weights.abs(), -weights.abs()
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        # The terms of two actions in the set differ by no more than twice the bound in sum, so the
+        # rounding errors do not depend on the actions' size.
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return type(self)(self.weights, self.bound * (1 - 2 * eps), validate_args=False)
+
+
+@dataclass(frozen=True, eq=False)
+class PositivePart(KinkedSumBound):
+    r"""The unbounded set :math:`\{a : \sum_i \max(weights_i a_i, 0) \le bound\}`.
+
+    With joint velocities as weights and torques as actions it limits the power that the joints
+    draw; power that they return does not count.
+
+    Args:
+        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
+        bound: ``(*batch,)``, positive and finite.
+    """
+
+    @staticmethod
+    def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
+        return weights.clamp(min=0), weights.clamp(max=0)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        # Terms may be as negative as the actions allow on the way to where they become positive.
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        size = self.bound + self.weights.abs().sum(-1) * magnitude
+        return type(self)(self.weights, self.bound - eps * size, validate_args=False)

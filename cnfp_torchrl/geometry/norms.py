@@ -1,4 +1,4 @@
-"""A bound of a matrix's norm."""
+"""Norms of vectors and matrices."""
 
 from __future__ import annotations
 
