@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.squashes import BoxSquash
-from cnfp_torchrl.geometry import Region, project_onto_intersection
+from cnfp_torchrl.geometry import Region, project_onto_intersection, require_action_bounds
 
 
 class NoDensityError(NotImplementedError):
@@ -46,9 +46,9 @@ class Projection(Bijector):
         if rounds < 1:
             raise ValueError(f"rounds: expected a number >= 1, given {rounds}")
         if validate_args:
-            region.bounds.validate()
+            require_action_bounds(region.bounds)
         self._allowed, self._region = region, region.eroded()
-        self._box = BoxSquash.onto(self._region.bounds, validate_args=validate_args)
+        self._box = BoxSquash.onto(self._region.bounds)
         self._rounds = rounds
 
     @property

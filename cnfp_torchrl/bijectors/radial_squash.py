@@ -8,7 +8,7 @@ from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.squashes import radial_log_det, squash_to_unit_ball
-from cnfp_torchrl.geometry import Region, scaled_direction
+from cnfp_torchrl.geometry import Region, require_action_bounds, scaled_direction
 
 
 class RadialSquash(Bijector):
@@ -22,10 +22,16 @@ class RadialSquash(Bijector):
 
     Args:
         region: sets, anchor and active flags, ``(*batch,)`` of them.
+        validate_args: whether to check the action bounds, which reads them on the host.
+
+    Raises:
+        GeometryError: when the action bounds are invalid.
     """
 
-    def __init__(self, region: Region) -> None:
+    def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
+        if validate_args:
+            require_action_bounds(region.bounds)
         self.region = region.eroded()
 
     @property

@@ -16,7 +16,15 @@ from torch.nn.functional import threshold
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.squashes import BoxSquash
-from cnfp_torchrl.geometry import Box, ConstraintSet, Gauge, Region, gauge_of_sides, sides
+from cnfp_torchrl.geometry import (
+    Box,
+    ConstraintSet,
+    Gauge,
+    Region,
+    gauge_of_sides,
+    require_action_bounds,
+    sides,
+)
 
 
 class ExactSquash(Bijector):
@@ -53,15 +61,13 @@ class ExactSquash(Bijector):
     def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
         if validate_args:
-            region.bounds.validate()
+            require_action_bounds(region.bounds)
         self.region = region.eroded()
         # All stages work in coordinates about the anchor, where the box squash and the gauges have
         # the same bounds in floating point. Were they a rounding error of the coordinates apart, a
         # gauge of 1 + e at the bounds would let samples overshoot by e times the distance to the
         # anchor, and near a bound one rounding error is a large e.
-        self._squash = BoxSquash.onto(self.region.bounds, validate_args=validate_args).about(
-            region.anchor
-        )
+        self._squash = BoxSquash.onto(self.region.bounds).about(region.anchor)
         self._retraction = self._retraction_into(self.region.sets[1:])
 
     @property

@@ -13,6 +13,8 @@ from cnfp_torchrl.geometry import (
     GeometryError,
     Region,
     broadcast_shape,
+    length,
+    require_action_bounds,
     scaled_direction,
 )
 
@@ -59,6 +61,8 @@ class ShellSquash(Bijector):
                 f"ShellSquash: expected 0 < inner < outer, not closer than {center.dtype} can tell "
                 f"apart, given inner {inner.tolist()}, outer {outer.tolist()}"
             )
+        if validate_args and region is not None:
+            require_action_bounds(region.bounds)
         self._region = None if region is None else region.eroded()
 
     @property
@@ -69,7 +73,7 @@ class ShellSquash(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         direction, unit_length, width = self._rays(latent)
-        rho = vector_norm(latent, dim=-1)
+        rho = length(latent)
         radius = self._inner + width * rho.tanh()
         action = self._center + direction * (radius / unit_length).unsqueeze(-1)
         return action, self._log_det(rho, radius, width, latent.shape[-1])
@@ -87,14 +91,14 @@ class ShellSquash(Bijector):
     def _rays(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return direction, its length, and the width of the shell along it."""
         direction, _ = scaled_direction(offset)
-        length = vector_norm(direction, dim=-1)
+        unit_length = vector_norm(direction, dim=-1)
         outer = self._outer
         if self._region is not None:
             _, gauge = self._region.outer_and_inner_gauge(direction)
-            outer = torch.minimum(outer, length / gauge)
+            outer = torch.minimum(outer, unit_length / gauge)
         width = outer - self._inner
         # A ray on which the region ends inside the hole has no allowed action: say so, loudly.
-        return direction, length, torch.where(width > 0, width, torch.nan)
+        return direction, unit_length, torch.where(width > 0, width, torch.nan)
 
     @staticmethod
     def _log_det(rho: Tensor, radius: Tensor, width: Tensor, dim: int) -> Tensor:

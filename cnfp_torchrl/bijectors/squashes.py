@@ -17,7 +17,15 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, GeometryError
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    Ellipsoid,
+    GeometryError,
+    power_of_two,
+    require_action_bounds,
+)
 
 SMALL = 0.01
 
@@ -46,35 +54,25 @@ class BoxSquash(Bijector):
         validate_args: whether to check the bounds, which reads them on the host.
 
     Raises:
-        GeometryError: when a bound is not finite, low >= high, or no room is left between the
-            bounds after erosion.
+        GeometryError: when a bound is not finite, low >= high, or bounds are closer than rounding
+            error or out of the dtype's range (`cnfp_torchrl.geometry.require_action_bounds`).
     """
 
     def __init__(self, low: Tensor, high: Tensor, *, validate_args: bool = True) -> None:
         box = Box(low, high, validate_args=validate_args)
-        self._set_image(box.eroded(box.magnitude()), validate_args)
+        if validate_args:
+            require_action_bounds(box, "BoxSquash")
+        self._set_image(box.eroded(box.magnitude()))
 
     @classmethod
-    def onto(cls, image: Box, *, validate_args: bool = True) -> Self:
-        """Return the squash onto a box that is eroded already."""
+    def onto(cls, image: Box) -> Self:
+        """Return the squash onto a box that is checked and eroded already."""
         squash = cls.__new__(cls)
-        squash._set_image(image, validate_args)
+        squash._set_image(image)
         return squash
 
-    def _set_image(self, image: Box, validate_args: bool) -> None:
+    def _set_image(self, image: Box) -> None:
         super().__init__()
-        if validate_args and bool(image.low.isinf().any() | image.high.isinf().any()):
-            raise GeometryError(
-                f"BoxSquash: expected finite bounds, given low {image.low.tolist()}, high "
-                f"{image.high.tolist()}; an unbounded box has no tanh squash, use it as a "
-                "constraint inside action bounds"
-            )
-        if validate_args and not bool((image.low < image.high).all()):
-            raise GeometryError(
-                f"BoxSquash: expected bounds further apart than rounding error in "
-                f"{image.low.dtype}, given low {image.low.tolist()}, high {image.high.tolist()} "
-                "after erosion"
-            )
         self._middle = (image.low + image.high) / 2
         self._half = (image.high - image.low) / 2
         self._log_slope_scale = (4 * self._half).log()
@@ -249,8 +247,12 @@ def paper_squash(constraint_set: ConstraintSet) -> Bijector:
 
 def squash_to_unit_ball(latent: Tensor) -> tuple[Tensor, Tensor]:
     """Return the radial squash of R^d into the unit ball and its log-determinant."""
-    q = latent.square().sum(-1)
-    return latent * tanhc(q).unsqueeze(-1), radial_log_det(q, latent.shape[-1])
+    # Latents whose square is out of range are squashed in units of their size.
+    unit = power_of_two(latent.abs().amax(-1).clamp(min=1))
+    scaled = latent / unit.unsqueeze(-1)
+    q = scaled.square().sum(-1)
+    log_det = radial_log_det(q, latent.shape[-1], unit)
+    return scaled * tanhc(q, unit).unsqueeze(-1), log_det
 
 
 def log_half_sech(x: Tensor) -> Tensor:
@@ -263,21 +265,30 @@ def log_sech_squared(x: Tensor) -> Tensor:
     return 2 * (math.log(2) + log_half_sech(x))
 
 
-def tanhc(q: Tensor) -> Tensor:
-    r"""Return :math:`\tanh(\rho)/\rho` of :math:`q = \rho^2 \ge 0`."""
+def tanhc(q: Tensor, unit: Tensor | float = 1.0) -> Tensor:
+    r"""Return :math:`\tanh(u \rho)/\rho` of :math:`q = \rho^2 \ge 0` and a unit u >= 1.
+
+    The unit is 1 where q < `SMALL`.
+    """
     small = q < SMALL
     rho = torch.where(small, 1.0, q).sqrt()
-    return torch.where(small, _series(_TANHC, torch.where(small, q, 0.0)), rho.tanh() / rho)
+    far = (unit * rho).tanh() / rho
+    return torch.where(small, _series(_TANHC, torch.where(small, q, 0.0)), far)
 
 
-def radial_log_det(q: Tensor, dim: int) -> Tensor:
+def radial_log_det(q: Tensor, dim: int, unit: Tensor | float = 1.0) -> Tensor:
     r"""Return log|det| of the radial squash :math:`z \mapsto \tanh(\rho)\, z/\rho` of R^d.
 
-    :math:`L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)` at :math:`q = \rho^2 = |z|^2`.
+    :math:`L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)` at :math:`\rho = |z|`.
+
+    Args:
+        q: :math:`|z/u|^2`, ``(*batch,)``.
+        dim: dimension d.
+        unit: u >= 1, ``(*batch,)``; 1 where q < `SMALL`.
     """
     small = q < SMALL
     near_q = torch.where(small, q, 0.0)
-    rho = torch.where(small, 1.0, q).sqrt()
+    rho = unit * torch.where(small, 1.0, q).sqrt()
     near, far = _series(_LOG_SECH_SQUARED, near_q), log_sech_squared(rho)
     if dim > 1:
         near = near + (dim - 1) * _series(_LOG_TANHC, near_q)

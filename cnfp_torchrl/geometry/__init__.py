@@ -2,7 +2,7 @@
 
 from cnfp_torchrl.geometry.anchors import MINIMUM_SLACK, chebyshev_center, lexicographic_anchor
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
-from cnfp_torchrl.geometry.box import Box, gauge_of_sides, sides
+from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
 from cnfp_torchrl.geometry.constraint_set import (
     EROSION_IN_EPS,
     Bounds,
@@ -10,8 +10,10 @@ from cnfp_torchrl.geometry.constraint_set import (
     Gauge,
     GeometryError,
     broadcast_shape,
+    largest_value,
 )
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
+from cnfp_torchrl.geometry.norms import length, power_of_two
 from cnfp_torchrl.geometry.projection import project, project_onto_intersection
 from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
@@ -42,9 +44,13 @@ __all__ = [
     "broadcast_shape",
     "chebyshev_center",
     "gauge_of_sides",
+    "largest_value",
+    "length",
     "lexicographic_anchor",
+    "power_of_two",
     "project",
     "project_onto_intersection",
+    "require_action_bounds",
     "scaled_direction",
     "sides",
 ]

@@ -12,8 +12,11 @@ from torch import Tensor
 from torch.linalg import solve_triangular, vector_norm
 
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
-from cnfp_torchrl.geometry.norms import spectral_norm_bound
+from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone
+
+MOST_SKEWED = 1e15
+"""The largest element of an ellipsoid's inverse, in units of the smallest diagonal element."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +43,16 @@ class Ball(ConstraintSet):
 
     def contains(self, action: Tensor) -> Tensor:
         offset = action.double() - self.center.double()
-        return vector_norm(offset, dim=-1) <= self.radius.double()
+        return length(offset) <= self.radius.double()
 
     def slack(self, action: Tensor) -> Tensor:
-        return self.radius - vector_norm(action - self.center, dim=-1)
+        return self.radius - length(action - self.center)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        return _ball_gauge_about(anchor - self.center, self.radius)
+        return ball_gauge_about(anchor - self.center, self.radius)
 
     def bounding_box(self) -> Bounds:
         radius = self.radius.unsqueeze(-1)
@@ -57,7 +60,7 @@ class Ball(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = self.radius + vector_norm(self.center, dim=-1)
+        size = self.radius + length(self.center)
         return type(self)(self.center, torch.sub(self.radius, size, alpha=eps), validate_args=False)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
@@ -70,7 +73,7 @@ class Ball(ConstraintSet):
     def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
         # The radius alone, because torch.where is slow where the mask broadcasts. A far center's
         # distance is known up to rounding error, which may be larger than what is to be added.
-        distance = vector_norm(center - self.center, dim=-1)
+        distance = length(center - self.center)
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         beyond = torch.add(distance, distance, alpha=eps) + radius
         return type(self)(
@@ -84,7 +87,7 @@ class Ball(ConstraintSet):
         when this ball has room for it there, and on the way to this ball's center m otherwise.
         """
         inner = self.radius.clamp(max=radius)
-        distance = vector_norm(self.center, dim=-1)
+        distance = length(self.center)
         room = self.radius - inner
         share = torch.where(room >= distance, torch.zeros_like(room), 1 - room / distance)
         return type(self)(self.center * share.unsqueeze(-1), inner, validate_args=False)
@@ -110,6 +113,12 @@ class Ellipsoid(ConstraintSet):
         yield "scale_tril", self.scale_tril.triu(1) != 0, "zeros above the diagonal"
         diagonal = torch.eye(self.dim, dtype=torch.bool, device=self.scale_tril.device)
         yield "scale_tril", (self.scale_tril <= 0) & diagonal, "a positive diagonal"
+        thin = ~(spectral_norm_bound(self._inverse()) < MOST_SKEWED)
+        yield (
+            "scale_tril",
+            thin,
+            f"an inverse below {MOST_SKEWED:g} over the smallest of its diagonal",
+        )
 
     def shape_problem(self) -> str | None:
         rows, columns = self.scale_tril.shape[-2:]
@@ -122,34 +131,35 @@ class Ellipsoid(ConstraintSet):
         return _solve(self.scale_tril, vector)
 
     def contains(self, action: Tensor) -> Tensor:
-        white = _solve(self.scale_tril.double(), action.double() - self.center.double())
-        return vector_norm(white, dim=-1) <= 1
+        return self.to(torch.float64).slack(action.double()) >= 0
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(1 - |T^-1 (a - m)|) / n``, n a bound of the norm of ``T^-1``."""
-        white = vector_norm(self.whiten(action - self.center), dim=-1)
-        return (1 - white) / self._inverse_norm()
+        unit, scale_tril = self._in_units()
+        offset = action - self.center
+        size = power_of_two(offset.abs().amax(-1))
+        white = size * length(_solve(scale_tril, offset / size.unsqueeze(-1)))
+        return (unit - white) / spectral_norm_bound(self._inverse())
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        offset = self.whiten(anchor - self.center)
-        return partial(self._gauge, _ball_gauge_about(offset, torch.ones_like(offset[..., 0])))
-
-    def _gauge(self, of_unit_ball: Gauge, direction: Tensor) -> Tensor:
-        return of_unit_ball(self.whiten(direction))
+        unit, scale_tril = self._in_units()
+        of_ball = ball_gauge_about(_solve(scale_tril, anchor - self.center), unit)
+        return lambda direction: of_ball(_solve(scale_tril, direction))
 
     def bounding_box(self) -> Bounds:
-        half = vector_norm(self.scale_tril, dim=-1)
+        half = length(self.scale_tril)
         return Bounds(self.center - half, self.center + half)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = vector_norm(self.scale_tril, dim=(-2, -1)) + vector_norm(self.center, dim=-1)
+        size = length(self.scale_tril.flatten(-2)) + length(self.center)
         # An ellipsoid thinner than its rounding error must not turn inside out: what is left of it
         # has no slack to speak of, so that it is dropped like an empty set.
-        share = (1 - eps * size * self._inverse_norm()).clamp(min=eps)
+        unit, _ = self._in_units()
+        share = (1 - eps * (size / unit) * spectral_norm_bound(self._inverse())).clamp(min=eps)
         return type(self)(
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
@@ -159,16 +169,24 @@ class Ellipsoid(ConstraintSet):
         return type(self)(center, scale_tril, validate_args=False)
 
     def superlevel(self) -> Cone:
-        inverse = solve_triangular(self.scale_tril, self._identity(), upper=False)
-        rate = self._inverse_norm()
-        return Cone(inverse, -self.whiten(self.center), torch.ones_like(rate), rate)
+        unit, scale_tril = self._in_units()
+        inverse = self._inverse()
+        return Cone(inverse, -_solve(scale_tril, self.center), unit, spectral_norm_bound(inverse))
 
     def _identity(self) -> Tensor:
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
 
-    def _inverse_norm(self) -> Tensor:
-        """Return a bound of the spectral norm of ``T^-1``."""
-        return spectral_norm_bound(solve_triangular(self.scale_tril, self._identity(), upper=False))
+    def _in_units(self) -> tuple[Tensor, Tensor]:
+        """Return the shortest half-axis u, or so, as a power of two, and ``T / u``.
+
+        In such units an inverse, and what it is applied to, have sizes that can be squared.
+        """
+        unit = power_of_two(self.scale_tril.diagonal(dim1=-2, dim2=-1).amin(-1))
+        return unit, self.scale_tril / unit[..., None, None]
+
+    def _inverse(self) -> Tensor:
+        """Return ``u T^-1``, with the u of `_in_units`."""
+        return solve_triangular(self._in_units()[1], self._identity(), upper=False)
 
 
 def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
@@ -215,11 +233,11 @@ class TaskSpaceBall(ConstraintSet):
 
     def contains(self, action: Tensor) -> Tensor:
         image = _image(self.jacobian.double(), action.double()) + self.offset.double()
-        return vector_norm(image, dim=-1) <= self.radius.double()
+        return length(image) <= self.radius.double()
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(radius - |J a + b|) / n``, n a bound of the norm of J, or 1 where J is zero."""
-        distance = vector_norm(_image(self.jacobian, action) + self.offset, dim=-1)
+        distance = length(_image(self.jacobian, action) + self.offset)
         return (self.radius - distance) / self._norm()
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
@@ -228,15 +246,15 @@ class TaskSpaceBall(ConstraintSet):
     def gauge_about(self, anchor: Tensor) -> Gauge:
         # In units of J's norm: what vanishes does so beside it, not beside one.
         norm = self._norm()
-        offset = (_image(self.jacobian, anchor) + self.offset) / norm.unsqueeze(-1)
+        offset = _image(self.jacobian, anchor) + self.offset
         jacobian = self.jacobian / norm[..., None, None]
-        return partial(_image_gauge, jacobian, _ball_gauge_about(offset, self.radius / norm))
+        return partial(_image_gauge, jacobian, ball_gauge_about(offset, self.radius, norm))
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
         terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
-        size = self.radius + vector_norm(terms, dim=-1)
+        size = self.radius + length(terms)
         radius = torch.sub(self.radius, size, alpha=eps)
         return type(self)(self.jacobian, self.offset, radius, validate_args=False)
 
@@ -264,27 +282,32 @@ def _image(jacobian: Tensor, vector: Tensor) -> Tensor:
     return (jacobian * vector.unsqueeze(-2)).sum(-1)
 
 
-def _ball_gauge_about(offset: Tensor, radius: Tensor) -> Gauge:
+def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None) -> Gauge:
     r"""Return the gauge of a ball about a point at an offset from the ball's center.
 
     With :math:`k = (r - |w|)(r + |w|)`, :math:`\beta = v \cdot w/k` and :math:`q = |v|^2/k`:
     :math:`g = \beta + \sqrt{\beta^2 + q}`, which cancels for :math:`\beta < 0`. With
     :math:`p = 2\max(\beta, 0)` and :math:`h = \sqrt{\beta^2 + q} + |\beta|`, written
     :math:`\sqrt{\beta^2 + q} + p - \beta` to have the right gradient at 0, :math:`g = p + q/h`
-    never does.
+    never does. Computed in units of the larger one of radius and offset, whose squares may be out
+    of range.
 
     Args:
         offset: w, the point minus the ball's center, ``(*batch, d)``, shorter than the radius.
         radius: r, ``(*batch,)``.
+        unit: the length that directions are given in, ``(*batch,)``; None means 1.
     """
+    size = power_of_two(torch.maximum(radius, offset.abs().amax(-1)))
+    offset, radius = offset / size.unsqueeze(-1), radius / size
     distance = vector_norm(offset, dim=-1)
     inverse = ((radius - distance) * (radius + distance)).reciprocal()
-    return partial(_ball_gauge, offset * inverse.unsqueeze(-1), inverse)
+    scale = size.reciprocal() if unit is None else unit / size
+    return partial(_ball_gauge, offset * inverse.unsqueeze(-1), inverse, scale)
 
 
-def _ball_gauge(scaled_offset: Tensor, inverse: Tensor, direction: Tensor) -> Tensor:
+def _ball_gauge(scaled_offset: Tensor, inverse: Tensor, scale: Tensor, direction: Tensor) -> Tensor:
     beta = (direction * scaled_offset).sum(-1)
     q = direction.square().sum(-1) * inverse
     ahead = beta.relu()
     h = torch.add(torch.addcmul(q, beta, beta).sqrt(), ahead, alpha=2) - beta
-    return torch.add(q / h, ahead, alpha=2)
+    return torch.add(q / h, ahead, alpha=2) * scale

@@ -29,6 +29,15 @@ def broadcast_shape(*shapes: torch.Size) -> torch.Size:
     return torch.broadcast_shapes(*known)
 
 
+def largest_value(dtype: torch.dtype) -> float:
+    """Return the largest finite number that a field may hold: 1e33 in float32, 1e150 in float64.
+
+    Sums of many stay finite, and so do their squares in the search for anchors, which is done in
+    float64.
+    """
+    return 1e33 if dtype == torch.float32 else 1e150
+
+
 class Bounds(NamedTuple):
     """Lower and upper bounds of the components of actions.
 
@@ -245,6 +254,9 @@ class ConstraintSet(ABC):
         self.validate_shapes(where)
         for field, value in self.fields().items():
             self._refuse(where, field, torch.isnan(value), "a number")
+            most = largest_value(self.dtype)
+            huge = (value.abs() > most) & value.isfinite()
+            self._refuse(where, field, huge, f"numbers up to {most:g}, the range of {self.dtype}")
         for field, bad, expected in self.invalid_fields():
             self._refuse(where, field, bad, expected)
         return self

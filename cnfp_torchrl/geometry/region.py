@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.box import Box, require_action_bounds
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, broadcast_shape
 
 
@@ -149,6 +149,8 @@ class Region:
         """
         from cnfp_torchrl.geometry.anchors import lexicographic_anchor
 
+        if sets and isinstance(sets[0], Box):
+            require_action_bounds(sets[0])
         point, active = lexicographic_anchor(sets, anchor)
         return cls(tuple(sets), point, active)
 

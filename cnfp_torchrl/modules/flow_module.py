@@ -16,7 +16,7 @@ from torchrl.modules import SafeProbabilisticModule
 
 from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
-from cnfp_torchrl.geometry import Box, Region
+from cnfp_torchrl.geometry import Box, Region, require_action_bounds
 from cnfp_torchrl.modules.constraint_bijector import (
     ANCHOR_KEY,
     ConstraintBijector,
@@ -224,7 +224,7 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = "action") -> Box:
             f"spec of '{action_key}': expected the same bounds for all batch elements, {given}; "
             "pass env.action_spec_unbatched"
         )
-    return Box(low[0].clone(), high[0].clone())
+    return require_action_bounds(Box(low[0].clone(), high[0].clone()), f"spec of '{action_key}'")
 
 
 def _finite_bounds(leaf: Any) -> tuple[Tensor, Tensor] | None:
