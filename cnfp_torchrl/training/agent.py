@@ -64,8 +64,8 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
     action_size = env.action_spec_unbatched.shape[-1]
     return make_constrained_actor(
         instantiate(config.network.actor, observation_size, action_size),
-        env.action_spec_unbatched,
-        constraint_bijectors(env) if config.env.geometry else [],
+        bijectors=constraint_bijectors(env) if config.env.geometry else [],
+        spec=env.action_spec_unbatched,
         order=list(config.flow.order),
         flow=instantiate(config.flow.combine),
     )
@@ -117,7 +117,10 @@ def load_actor(
         folder: the run.
         config: its configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
+
+    Raises:
+        ValueError: when the run's checkpoint is not that of such an actor.
     """
     actor = build_actor(config, env)
-    actor.load_state_dict(folder.load_checkpoint()["actor"])
+    folder.restore(actor=actor)
     return actor.eval()
