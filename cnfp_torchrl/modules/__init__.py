@@ -1,6 +1,7 @@
 """TensorDictModules that give actors hard action constraints."""
 
 from cnfp_torchrl.modules.actors import (
+    actor_modules,
     constrain,
     flow_head,
     has_density,
@@ -39,6 +40,7 @@ __all__ = [
     "SafeRandomPolicy",
     "UnconstrainedFlow",
     "WarmUpPolicy",
+    "actor_modules",
     "constrain",
     "flow_head",
     "guarded",
