@@ -13,11 +13,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
+from cnfp_torchrl.objectives import ConstrainedSACLoss
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
@@ -29,6 +30,7 @@ from cnfp_torchrl.training.settings import (
     require_frames,
     require_settings,
 )
+from cnfp_torchrl.training.update import Update
 from cnfp_torchrl.training.watching import (
     RECORDING,
     EpisodeCollector,
@@ -69,6 +71,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
+    update = Update(loss, optimizer, target)
 
     # Data
     policy = WarmUpPolicy(actor, settings.warmup_frames)
@@ -76,9 +79,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
-    kept = [*actor.in_keys, "action"]
-    kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
-    kept += [key for key in [("next", "cost")] if key in loss.in_keys]
+    kept = kept_keys(actor, loss)
 
     watcher: TrainingWatcher = Unwatched()
     if watch is not None:
@@ -94,14 +95,6 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         interval=settings.log_interval,
     )
 
-    def update() -> TensorDictBase:
-        losses = loss(buffer.sample())
-        optimizer.zero_grad()
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        optimizer.step()
-        target.step()
-        return losses
-
     owed = 0.0
     with closing(watcher):
         for collected in collector:
@@ -112,7 +105,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             if metrics.frames >= settings.warmup_frames:
                 owed += batch.numel() * settings.update_ratio
                 while owed >= 1:
-                    metrics.add_losses(update())
+                    metrics.add_losses(update(buffer.sample()))
                     owed -= 1
             metrics.log_if_due()
         metrics.finish()
@@ -139,6 +132,15 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             for episode in shown.episodes.values():
                 watcher.see_episode(episode)
     return summary
+
+
+def kept_keys(
+    actor: SafeProbabilisticTensorDictSequential, loss: ConstrainedSACLoss
+) -> list[NestedKey]:
+    """Return what of a transition is stored: what actor and loss read."""
+    kept: list[NestedKey] = [*actor.in_keys, "action"]
+    kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
+    return kept + [key for key in [("next", "cost")] if key in loss.in_keys]
 
 
 def _evaluations(
