@@ -11,6 +11,7 @@ from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.point_nav import PointNavEnv
 from cnfp_torchrl.envs.point_nav_geometry import BatteryGeometry, ObstacleGeometry
 from cnfp_torchrl.envs.rendering import render_point_nav
+from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
 from cnfp_torchrl.envs.shortest_path import ShortestPath
 from cnfp_torchrl.envs.visible_geometry import VisibleObstacleGeometry
 
@@ -29,6 +30,7 @@ __all__ = [
     "PointNavEnv",
     "PointNavGymnasiumEnv",
     "RewardPenalty",
+    "SampledGeometry",
     "ShortestPath",
     "State",
     "Transition",
@@ -36,5 +38,6 @@ __all__ = [
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
+    "constraints_to_sample",
     "render_point_nav",
 ]

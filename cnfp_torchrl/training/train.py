@@ -13,12 +13,10 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict.utils import NestedKey
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
-from cnfp_torchrl.objectives import ConstrainedSACLoss
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
@@ -30,6 +28,7 @@ from cnfp_torchrl.training.settings import (
     require_frames,
     require_settings,
 )
+from cnfp_torchrl.training.storage import prepare_buffer
 from cnfp_torchrl.training.update import Update
 from cnfp_torchrl.training.watching import (
     RECORDING,
@@ -79,7 +78,13 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
-    kept = kept_keys(actor, loss)
+    kept = prepare_buffer(
+        buffer,
+        env,
+        actor.in_keys,
+        other_keys=[key for key in [("next", "cost")] if key in loss.in_keys],
+        constraint_bytes=settings.constraint_bytes,
+    )
 
     watcher: TrainingWatcher = Unwatched()
     if watch is not None:
@@ -132,15 +137,6 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             for episode in shown.episodes.values():
                 watcher.see_episode(episode)
     return summary
-
-
-def kept_keys(
-    actor: SafeProbabilisticTensorDictSequential, loss: ConstrainedSACLoss
-) -> list[NestedKey]:
-    """Return what of a transition is stored: what actor and loss read."""
-    kept: list[NestedKey] = [*actor.in_keys, "action"]
-    kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
-    return kept + [key for key in [("next", "cost")] if key in loss.in_keys]
 
 
 def _evaluations(

@@ -41,7 +41,8 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.envs import POINT_NAV_ID
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.train import kept_keys, train
+from cnfp_torchrl.training.storage import prepare_buffer
+from cnfp_torchrl.training.train import train
 from cnfp_torchrl.training.update import Update
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -70,7 +71,8 @@ def our_update(flow: str, width: int, *, compiled: bool = False) -> Callable[[],
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
     buffer = instantiate(config.replay_buffer)
     steps = env.rollout(200, actor, break_when_any_done=False).detach().reshape(-1)
-    buffer.extend(steps.select(*kept_keys(actor, loss)))
+    limit = config.training.constraint_bytes
+    buffer.extend(steps.select(*prepare_buffer(buffer, env, actor.in_keys, constraint_bytes=limit)))
     update = Update(loss, optimizer, target, compiled=compiled)
     return lambda: update(buffer.sample())
 

@@ -1,0 +1,38 @@
+"""The replay buffer of a run: what it stores of a transition, and what it computes at sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.utils import NestedKey
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+
+from cnfp_torchrl.envs import SampledGeometry, constraints_to_sample
+
+
+def prepare_buffer(
+    buffer: TensorDictReplayBuffer,
+    env: EnvBase,
+    state_keys: Sequence[NestedKey],
+    *,
+    other_keys: Sequence[NestedKey] = (),
+    constraint_bytes: int,
+) -> list[NestedKey]:
+    """Let a buffer compute at sampling what takes much memory; return the keys to store in it.
+
+    Args:
+        buffer: an empty one.
+        env: publishes what is to be stored.
+        state_keys: what the actor reads of a state.
+        other_keys: what the loss reads besides states, action, reward and ends.
+        constraint_bytes: how much of a transition may be stored for constraints; sets that do not
+            fit are computed (`cnfp_torchrl.envs.constraints_to_sample`).
+    """
+    computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
+    stored = [key for key in state_keys if key not in computed.field_keys]
+    state = list(dict.fromkeys([*computed.state_keys, *stored]))
+    if computed.field_keys:
+        buffer.append_transform(computed)
+    outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
+    return [*state, "action", *outcome, *other_keys]
