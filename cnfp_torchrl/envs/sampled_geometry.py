@@ -65,7 +65,7 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
     """Return the constraints whose sets are to be computed at sampling, to store few bytes.
 
     What an actor reads of ``constraints`` is stored at the root and under ``next``. The sets of a
-    constraint are stored where all that is stored fits the limit, the smallest sets first, because
+    constraint are stored where all that is stored fits the limit, the largest sets first, because
     looking up takes less time than computing. Anchor and flags, which take longest to compute,
     always are.
 
@@ -83,7 +83,7 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
     fields = _fields(env) if _geometries(env) else {}
     sets = {name: sum(sizes.pop(key, 0) for key in fields[name]) for name in fields}
     stored, sampled = sum(sizes.values()), []
-    for name in sorted(sets, key=lambda name: sets[name]):
+    for name in sorted(sets, key=lambda name: -sets[name]):
         if stored + sets[name] <= limit:
             stored += sets[name]
         else:

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import zip_longest
 from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import SafeModule, ValueOperator
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, distance_loss
 
-from cnfp_torchrl.modules import actor_modules
+from cnfp_torchrl.objectives.actor_pass import distribution, distribution_of_both, is_plain
 from cnfp_torchrl.objectives.stacked_perceptron import StackedPerceptron
 
 T = TypeVar("T")
 
-_PLAIN_MODULES = (TensorDictModule, SafeModule, ValueOperator)
-"""Modules that do no more than call their network on their in_keys and write what it returns."""
+Drawn = tuple[Tensor, Tensor]
+"""Actions and their log-densities."""
 
 
 class BatchedSACLoss(SACLoss):
@@ -31,9 +31,9 @@ class BatchedSACLoss(SACLoss):
     The critics are applied together, one batched matrix product a layer, where they are perceptrons
     (`StackedPerceptron`): a `torchrl.modules.MLP`, or a `torch.nn.Sequential`, of linear layers and
     elementwise activations in a TensorDictModule. Other critics go through `torch.vmap` as in
-    SACLoss. The actor's own modules are called, once on the states and once on the next ones,
-    without swapping their parameters for themselves. A state_dict of either loss is one of the
-    other.
+    SACLoss. The actor's own modules are called without swapping their parameters for themselves,
+    and a constrained actor's flow once for states and next states. A state_dict of either loss is
+    one of the other, and a seed gives both the same noise on a CPU.
 
     Args:
         args: as for `torchrl.objectives.SACLoss`.
@@ -47,37 +47,65 @@ class BatchedSACLoss(SACLoss):
         super()._make_vmap()
         self._ensembles = {}
 
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses, ``alpha`` and ``entropy``; write the priority to the tensordict."""
+        if self._version == 1 or self.skip_done_states:
+            return super().forward(tensordict)
+        next_drawn, drawn = self._draw_both(tensordict)
+        loss_qvalue, metadata = self._critics_loss(tensordict, next_drawn)
+        tensordict.set(self.tensor_keys.priority, metadata["td_error"])
+        log_prob = drawn[1].detach()
+        losses = {
+            "loss_actor": self._actor_loss(tensordict, drawn),
+            "loss_qvalue": loss_qvalue,
+            "loss_alpha": self._reduced(self._alpha_loss(log_prob), tensordict),
+        }
+        scalars = {"alpha": self._alpha, "entropy": -log_prob.mean()}
+        if self.reduction != "none":
+            return TensorDict({**losses, **scalars}, [])
+        returned = TensorDict(losses, tensordict.batch_size)
+        if self.scalar_output_mode == "non_tensor":
+            for name, value in scalars.items():
+                returned.set_non_tensor(name, value)
+        return returned
+
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the actor's loss, and the ``log_prob`` of the actions that it drew."""
-        action, log_prob = self._draw(tensordict)
-        value = self._values("qvalue_network", tensordict, action, detached=True)
-        loss = self._reduce_loss(
-            self._alpha * log_prob - value.amin(0).squeeze(-1),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
-        return loss, {"log_prob": log_prob.detach()}
+        drawn = self._draw(tensordict)
+        return self._actor_loss(tensordict, drawn), {"log_prob": drawn[1].detach()}
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the critics' loss, summed over them, and their largest ``td_error``."""
-        target = self._compute_target_v2(tensordict)
+        drawn = None
+        if not self.skip_done_states:
+            with torch.no_grad():
+                drawn = self._draw(tensordict.get("next"))
+        return self._critics_loss(tensordict, drawn)
+
+    def _actor_loss(self, tensordict: TensorDictBase, drawn: Drawn) -> Tensor:
+        action, log_prob = drawn
+        value = self._values("qvalue_network", tensordict, action, detached=True)
+        return self._reduced(self._alpha * log_prob - value.amin(0).squeeze(-1), tensordict)
+
+    def _critics_loss(
+        self, tensordict: TensorDictBase, drawn: Drawn | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the critics' loss for next actions; without any, it draws where states go on."""
+        if drawn is None:
+            target = self._compute_target_v2(tensordict)
+        else:
+            target = self._target(tensordict, *drawn)
         action = tensordict.get(self.tensor_keys.action)
         predicted = self._values("qvalue_network", tensordict, action).squeeze(-1)
         target = target.expand_as(predicted)
-        loss = self._reduce_loss(
-            distance_loss(predicted, target, loss_function=self.loss_function).sum(0),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
-        return loss, {"td_error": (predicted.detach() - target).abs().amax(0)}
+        loss = distance_loss(predicted, target, loss_function=self.loss_function).sum(0)
+        td_error = (predicted.detach() - target).abs().amax(0)
+        return self._reduced(loss, tensordict), {"td_error": td_error}
 
     @torch.no_grad()
-    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
-        if self.skip_done_states:
-            return super()._compute_target_v2(tensordict)
-        outcome = tensordict.get("next")
-        action, log_prob = self._draw(outcome)
-        value = self._values("target_qvalue_network", outcome, action)
+    def _target(self, tensordict: TensorDictBase, action: Tensor, log_prob: Tensor) -> Tensor:
+        value = self._values("target_qvalue_network", tensordict.get("next"), action)
         if value.shape[1:] != log_prob.shape:
             log_prob = log_prob.unsqueeze(-1)
         soft = (value - self._alpha * log_prob).amin(0)
@@ -86,14 +114,37 @@ class BatchedSACLoss(SACLoss):
             tensordict = tensordict.clone(False)  # whose rewards it replaces
         return estimator.value_estimate(tensordict, next_value=soft).squeeze(-1)
 
-    def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _reduced(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    def _draw(self, tensordict: TensorDictBase) -> Drawn:
         """Draw an action of the actor for each state, with its log-density."""
+        with self._acting() as actor:
+            return compute_rsample_log_prob(distribution(actor, tensordict))
+
+    def _draw_both(self, tensordict: TensorDictBase) -> tuple[Drawn, Drawn]:
+        """Draw actions for the next states, without gradients, and for the states."""
+        outcome = tensordict.get("next")
+        with self._acting() as actor:
+            both = distribution_of_both(actor, outcome, tensordict)
+            if both is not None:
+                (next_action, action), (next_score, score) = compute_rsample_log_prob(both)
+                return (next_action.detach(), next_score.detach()), (action, score)
+            with torch.no_grad():
+                before = compute_rsample_log_prob(distribution(actor, outcome))
+            return before, compute_rsample_log_prob(distribution(actor, tensordict))
+
+    @contextmanager
+    def _acting(self) -> Iterator[ProbabilisticTensorDictSequential]:
+        """Yield the actor with the parameters that this loss trains."""
         actor = self.actor_network
         with set_exploration_type(ExplorationType.RANDOM):
             if self._actor_holds_its_parameters():
-                return compute_rsample_log_prob(distribution(actor, tensordict))
-            with self.actor_network_params.to_module(actor, preserve_module_state=False):
-                return compute_rsample_log_prob(distribution(actor, tensordict))
+                yield actor
+            else:
+                with self.actor_network_params.to_module(actor, preserve_module_state=False):
+                    yield actor
 
     def _values(
         self, name: str, tensordict: TensorDictBase, action: Tensor, *, detached: bool = False
@@ -187,39 +238,3 @@ class BatchedSACLoss(SACLoss):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._make_vmap()
-
-
-def distribution(
-    actor: ProbabilisticTensorDictSequential, tensordict: TensorDictBase
-) -> torch.distributions.Distribution:
-    """Return ``actor.get_dist(tensordict)`` without the bookkeeping, where the modules are plain.
-
-    tensordict 0.14 looks on disk for pandas at each entry that a TensorDictModule writes, which
-    takes longer than a small network.
-    """
-    *body, head = actor_modules(actor)
-    keys = [key for module in body for key in module.out_keys]
-    if actor.return_composite or not all(map(is_plain, body)) or not _are_strings(keys):
-        return actor.get_dist(tensordict)
-    # Entries that are tensordicts are shared, which is safe because only strings are written.
-    state = TensorDict(dict(tensordict.items()), tensordict.batch_size, tensordict.device)
-    for module in body:
-        returned = module.module(*(state.get(key) for key in module.in_keys))
-        outputs = returned if isinstance(returned, tuple) else (returned,)
-        for key, value in zip(module.out_keys, outputs, strict=True):
-            state.set(key, value)
-    return head.get_dist(state)
-
-
-def _are_strings(keys: list[Any]) -> bool:
-    return all(isinstance(key, str) and key != "_" for key in keys)
-
-
-def is_plain(module: nn.Module) -> bool:
-    """Tell whether a module only calls its network on its in_keys and writes what that returns."""
-    return (
-        type(module) in _PLAIN_MODULES
-        and module.method is None
-        and module._kwargs is None
-        and not (module._forward_hooks or module._forward_pre_hooks or module._backward_hooks)
-    )

@@ -160,11 +160,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         loss_qvalue, qvalue_metadata = self.qvalue_v2_loss(tensordict)
         loss_cost = self.cost_loss(tensordict)
         loss_actor, metadata = self.actor_loss(tensordict)
-        loss_alpha = self._reduce_loss(
-            self._alpha_loss(log_prob=metadata["log_prob"]),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        loss_alpha = self._reduced(self._alpha_loss(metadata["log_prob"]), tensordict)
         tensordict.set(self.tensor_keys.priority, qvalue_metadata["td_error"])
         expected_cost = metadata["cost_value"].flatten(0, -2).mean(0)
         losses = {
@@ -188,11 +184,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         value = self._values("qvalue_network", tensordict, action, detached=True)
         cost = self._costs("cost_network", tensordict, action, detached=True).amax(0)
         price = (self.multipliers * cost).sum(-1)
-        loss = self._reduce_loss(
-            self._alpha * log_prob - value.amin(0).squeeze(-1) + price,
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        loss = self._reduced(self._alpha * log_prob - value.amin(0).squeeze(-1) + price, tensordict)
         return loss, {"log_prob": log_prob.detach(), "cost_value": cost.detach()}
 
     def cost_loss(self, tensordict: TensorDictBase) -> Tensor:
@@ -203,11 +195,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         # Not the robust loss of the value critic: it estimates something like a median, and that of
         # a rare event, such as reaching a station just in time, is its absence.
         loss = (predicted - target).square()
-        return self._reduce_loss(
-            loss.sum(-1).sum(0),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        return self._reduced(loss.sum(-1).sum(0), tensordict)
 
     def lagrange_loss(self, expected_cost: Tensor) -> Tensor:
         """Return the multipliers' loss.
