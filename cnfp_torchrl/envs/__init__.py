@@ -7,6 +7,7 @@ from cnfp_torchrl.envs.dynamics import PointNavDynamics, State, Transition
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.gymnasium_env import POINT_NAV_ID, PointNavGymnasiumEnv, register
 from cnfp_torchrl.envs.layout import Layout
+from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.point_nav import PointNavEnv
 from cnfp_torchrl.envs.point_nav_geometry import BatteryGeometry, ObstacleGeometry
@@ -26,6 +27,7 @@ __all__ = [
     "GeometryTransform",
     "Layout",
     "ObstacleGeometry",
+    "PackedStates",
     "PointNavDynamics",
     "PointNavEnv",
     "PointNavGymnasiumEnv",

@@ -16,6 +16,7 @@ from cnfp_torchrl.envs.geometry_transform import (
     GeometryTransform,
     appended_transforms,
 )
+from cnfp_torchrl.envs.packed_states import POINTER_BYTES
 
 
 class SampledGeometry(Transform):
@@ -64,7 +65,7 @@ class SampledGeometry(Transform):
 def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -> list[str]:
     """Return the constraints whose sets are to be computed at sampling, to store few bytes.
 
-    What an actor reads of ``constraints`` is stored at the root and under ``next``. The sets of a
+    What an actor reads of ``constraints`` is stored once a state (`PackedStates`). The sets of a
     constraint are stored where all that is stored fits the limit, the largest sets first, because
     looking up takes less time than computing. Anchor and flags, which take longest to compute,
     always are.
@@ -72,17 +73,17 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
     Args:
         env: the environment whose transforms publish the geometry.
         keys: what the actor reads of a state.
-        limit: bytes of a transition that may be stored for constraints.
+        limit: bytes of a stored transition that may be for constraints.
     """
     spec = env.observation_spec
     sizes = {
-        key: 2 * prod(spec[key].shape[spec.ndim :]) * spec[key].dtype.itemsize
+        key: prod(spec[key].shape[spec.ndim :]) * spec[key].dtype.itemsize
         for key in keys
         if isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY
     }
     fields = _fields(env) if _geometries(env) else {}
     sets = {name: sum(sizes.pop(key, 0) for key in fields[name]) for name in fields}
-    stored, sampled = sum(sizes.values()), []
+    stored, sampled = POINTER_BYTES + sum(sizes.values()), []
     for name in sorted(sets, key=lambda name: -sets[name]):
         if stored + sets[name] <= limit:
             stored += sets[name]

@@ -8,7 +8,8 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs import PackedStates, SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs.geometry_transform import CONSTRAINTS_KEY
 
 
 def prepare_buffer(
@@ -19,19 +20,24 @@ def prepare_buffer(
     other_keys: Sequence[NestedKey] = (),
     constraint_bytes: int,
 ) -> list[NestedKey]:
-    """Let a buffer compute at sampling what takes much memory; return the keys to store in it.
+    """Let a buffer store little of constraints; return the keys of transitions to extend it with.
+
+    What the actor reads of ``constraints`` is stored once a state (`PackedStates`) where it fits;
+    sets that do not are computed at sampling (`SampledGeometry`).
 
     Args:
-        buffer: an empty one.
+        buffer: an empty one that overwrites the oldest transitions first.
         env: publishes what is to be stored.
         state_keys: what the actor reads of a state.
         other_keys: what the loss reads besides states, action, reward and ends.
-        constraint_bytes: how much of a transition may be stored for constraints; sets that do not
-            fit are computed (`cnfp_torchrl.envs.constraints_to_sample`).
+        constraint_bytes: how much of a transition may be stored for constraints.
     """
     computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
     stored = [key for key in state_keys if key not in computed.field_keys]
     state = list(dict.fromkeys([*computed.state_keys, *stored]))
+    packed = [key for key in state if isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY]
+    if packed:
+        buffer.append_transform(PackedStates(packed, buffer.storage.max_size))
     if computed.field_keys:
         buffer.append_transform(computed)
     outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
