@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, Transform
 
-from cnfp_torchrl.envs.centre import constraint_bijectors
+from cnfp_torchrl.envs.anchor_transform import constraint_bijectors
 from cnfp_torchrl.envs.geometry_transform import (
     CONSTRAINTS_KEY,
     GeometryTransform,

@@ -38,7 +38,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from cnfp_torchrl.configuration import config_directory
-from cnfp_torchrl.envs import POINT_NAV_ID
+from cnfp_torchrl.tasks.point_nav import POINT_NAV_ID
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.storage import prepare_buffer
@@ -48,7 +48,7 @@ from cnfp_torchrl.training.update import Update
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 REFERENCE = "Stable-Baselines3"
 PRODUCTS = "matrix products alone"
-FLOWS = {"exact flow": "exact", "unconstrained": "none"}
+FLOWS = {"exact flow": "exact", "unconstrained": "unconstrained"}
 AGENTS, BATCH, GAMMA, TAU, LEARNING_RATE = 16, 256, 0.95, 0.005, 1e-3
 Rounds = dict[str, list[float]]
 

@@ -8,11 +8,8 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import GymEnv, TransformedEnv
 
 from cnfp_torchrl.envs import (
-    BatteryGeometry,
     GeometryTransform,
-    ObstacleGeometry,
     PackedStates,
-    PointNavEnv,
     SampledGeometry,
     constrain_env,
     constraint_bijectors,
@@ -20,6 +17,7 @@ from cnfp_torchrl.envs import (
 )
 from cnfp_torchrl.geometry import Ball, ConstraintSet, HalfSpaces
 from cnfp_torchrl.modules import ConstrainedFlowModule
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.storage import prepare_buffer
 
 

@@ -164,7 +164,7 @@ def assert_equal(losses: list[SACLoss], batch: TensorDictBase) -> None:
 
 @pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize(
-    "actor", ["TanhNormal", "none", "exact", "exact, reference", "squash", "radial"]
+    "actor", ["TanhNormal", "unconstrained", "exact", "exact, reference", "squash", "radial"]
 )
 def test_it_equals_torchrl_s_for_any_actor_and_critic(
     make_any_actor: MakeActor, batch: TensorDictBase, actor: str, critic: str
@@ -185,7 +185,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "l2": {"loss_function": "l2"},
     "l1": {"loss_function": "l1"},
     "sum": {"reduction": "sum"},
-    "each": {"reduction": "none", "scalar_output_mode": "exclude"},
+    "each": {"reduction": "unconstrained", "scalar_output_mode": "exclude"},
     "no target critics": {"delay_qvalue": False},
     "no vmap": {"deactivate_vmap": True},
     "ended states skipped": {"skip_done_states": True},
@@ -212,14 +212,14 @@ def test_it_equals_torchrl_s_for_any_value_estimator(
     make_any_actor: MakeActor, batch: TensorDictBase, estimator: dict[str, Any]
 ) -> None:
     critic = CRITICS["perceptron"]()
-    losses = both(make_any_actor("none"), critic, estimator=estimator)
+    losses = both(make_any_actor("unconstrained"), critic, estimator=estimator)
     assert_equal(losses, batch.reshape(16, 16))
 
 
 def test_it_equals_torchrl_s_with_several_steps_priorities_and_masks(
     make_any_actor: MakeActor, batch: TensorDictBase
 ) -> None:
-    losses = both(make_any_actor("none"), CRITICS["perceptron"]())
+    losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     batch["steps_to_next_obs"] = torch.randint(1, 4, (256, 1))
     assert_equal(losses, batch)
     batch["priority_weight"] = torch.rand(256)
@@ -247,7 +247,7 @@ def test_it_equals_torchrl_s_in_float64(make_any_actor: MakeActor, batch: Tensor
 def test_it_equals_torchrl_s_under_other_keys(
     make_any_actor: MakeActor, batch: TensorDictBase
 ) -> None:
-    losses = both(make_any_actor("none"), CRITICS["perceptron"]())
+    losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     renamed = {"reward": "gain", "terminated": "over", "done": "ended", "priority": "surprise"}
     for name, other in renamed.items():
         if name != "priority":
@@ -261,7 +261,7 @@ def test_it_equals_torchrl_s_under_other_keys(
 
 def test_it_is_called_with_tensors(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
     results = []
-    for loss in both(make_any_actor("none"), CRITICS["perceptron"]()):
+    for loss in both(make_any_actor("unconstrained"), CRITICS["perceptron"]()):
         torch.manual_seed(1)
         entries = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss.in_keys}
         loss.select_out_keys("loss_actor", "loss_qvalue")
@@ -412,7 +412,7 @@ def test_other_networks_are_left_to_vmap(network: nn.Module) -> None:
 def test_the_base_of_the_comparison_is_sensitive(
     make_any_actor: MakeActor, batch: TensorDictBase
 ) -> None:
-    losses = both(make_any_actor("none"), CRITICS["perceptron"]())
+    losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     with torch.no_grad():
         next(iter(losses[1].target_qvalue_network_params.values(True, True)))[1].mul_(1.01)
     with pytest.raises(AssertionError):
