@@ -8,15 +8,20 @@ from cnfp_torchrl.envs.anchor_transform import (
 )
 from cnfp_torchrl.envs.cost import ConstraintCost, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
+from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
 
 __all__ = [
     "ActionGuard",
     "ConstraintAnchor",
     "ConstraintCost",
     "GeometryTransform",
+    "PackedStates",
     "RewardPenalty",
+    "SampledGeometry",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
+    "constraints_to_sample",
 ]
