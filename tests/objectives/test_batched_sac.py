@@ -185,7 +185,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "l2": {"loss_function": "l2"},
     "l1": {"loss_function": "l1"},
     "sum": {"reduction": "sum"},
-    "each": {"reduction": "unconstrained", "scalar_output_mode": "exclude"},
+    "each": {"reduction": "none", "scalar_output_mode": "exclude"},
     "no target critics": {"delay_qvalue": False},
     "no vmap": {"deactivate_vmap": True},
     "ended states skipped": {"skip_done_states": True},
