@@ -7,6 +7,9 @@ of the way here; any other actor is asked for its distribution as usual.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
@@ -73,14 +76,32 @@ def distribution_of_both(
     location = written[1].get(head.parameter_keys[0])
     if location is None or (location.device.type == "cpu" and location.numel() % _BLOCK):
         return None
-    states = TensorDict({}, [2, *first.batch_size], first.device)
-    for key in head.in_keys:
+    states = _Both((first, second), written)
+    return head.get_dist(cast(TensorDictBase, states))
+
+
+class _Both:
+    """Two batches of states that are stacked entry by entry as these are read.
+
+    What of a tensordict a `ConstrainedFlowModule` asks for: building one, with its nested ones,
+    takes half as long as building the flow.
+    """
+
+    def __init__(
+        self, parts: Sequence[TensorDictBase], written: Sequence[dict[NestedKey, Tensor]]
+    ) -> None:
+        self._parts, self._written = parts, written
+        self.shape = self.batch_size = torch.Size((2, *parts[0].batch_size))
+
+    def get(self, key: NestedKey, default: Tensor | None = None) -> Tensor | None:
         values = [
-            known[key] if key in known else each.get(key)
-            for known, each in zip(written, (first, second), strict=True)
+            known[key] if key in known else part.get(key, None)
+            for part, known in zip(self._parts, self._written, strict=True)
         ]
-        states.set(key, torch.stack(values))
-    return head.get_dist(states)
+        return default if any(value is None for value in values) else torch.stack(values)
+
+    def keys(self, *args: Any, **kwargs: Any) -> Iterable[NestedKey]:
+        return self._parts[1].keys(*args, **kwargs)
 
 
 def _written(body: list[TensorDictModule], tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:

@@ -22,8 +22,8 @@ def prepare_buffer(
 ) -> list[NestedKey]:
     """Let a buffer store little of constraints; return the keys of transitions to extend it with.
 
-    What the actor reads of ``constraints`` is stored once a state (`PackedStates`) where it fits;
-    sets that do not are computed at sampling (`SampledGeometry`).
+    What the actor reads is stored once a state (`PackedStates`), besides sets that are too large:
+    those are computed at sampling (`SampledGeometry`). Without constraints nothing is done.
 
     Args:
         buffer: an empty one that overwrites the oldest transitions first.
@@ -35,9 +35,8 @@ def prepare_buffer(
     computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
     stored = [key for key in state_keys if key not in computed.field_keys]
     state = list(dict.fromkeys([*computed.state_keys, *stored]))
-    packed = [key for key in state if isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY]
-    if packed:
-        buffer.append_transform(PackedStates(packed, buffer.storage.max_size))
+    if any(isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY for key in state):
+        buffer.append_transform(PackedStates(state, buffer.storage.max_size))
     if computed.field_keys:
         buffer.append_transform(computed)
     outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
