@@ -69,6 +69,7 @@ FREE_OR_PORT = Expected(f"{PORT.words}, or null", lambda x: x is None or PORT.fi
 _EXPECTED = {
     "seed": WHOLE,
     "threads": COUNT,
+    "compile": FLAG,
     "batch": COUNT,
     "env.agents": COUNT,
     "env.penalty.penalty": POSITIVE,

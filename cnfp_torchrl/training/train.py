@@ -76,10 +76,13 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
-    update = Update(loss, optimizer, target)
+    update = Update(loss, optimizer, target, compiled=config.compile)
 
     # Data
     policy = WarmUpPolicy(actor, settings.warmup_frames)
+    if config.compile:
+        # Not the policy around it, which counts: a number that changes would be compiled anew.
+        policy.actor = torch.compile(actor)
     collector = instantiate(config.collector, _partial_=True)(env, policy)
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames

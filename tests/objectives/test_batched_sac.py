@@ -236,6 +236,14 @@ def test_it_equals_torchrl_s_for_any_batch_shape(
     assert_equal(losses, batch.reshape(shape))
 
 
+@pytest.mark.parametrize("size", [1, 7, 8, 10])
+def test_it_equals_torchrl_s_for_any_number_of_transitions(
+    make_any_actor: MakeActor, batch: TensorDictBase, size: int
+) -> None:
+    losses = both(make_any_actor("exact, reference"), CRITICS["perceptron"]())
+    assert_equal(losses, batch[:size])
+
+
 def test_it_equals_torchrl_s_in_float64(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
     losses = both(make_any_actor("TanhNormal"), CRITICS["perceptron"]())
     for loss in losses:
