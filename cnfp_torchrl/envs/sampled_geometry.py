@@ -10,13 +10,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, Transform
 
-from cnfp_torchrl.envs.anchor_transform import constraint_bijectors
-from cnfp_torchrl.envs.geometry_transform import (
-    CONSTRAINTS_KEY,
-    GeometryTransform,
-    appended_transforms,
-)
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import POINTER_BYTES
+from cnfp_torchrl.keys import CONSTRAINTS_KEY, field_key
+from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
 
 class SampledGeometry(Transform):
@@ -56,7 +53,7 @@ class SampledGeometry(Transform):
             allowed = geometry.constraint_set(states)
             for field, value in allowed.fields().items():
                 event = value.shape[value.ndim - allowed.event_dims[field] :]
-                key = (CONSTRAINTS_KEY, geometry.name, field)
+                key = field_key(geometry.name, field)
                 for part, each in zip(parts, value.expand(*states.shape, *event), strict=True):
                     part.set(key, each)
         return tensordict

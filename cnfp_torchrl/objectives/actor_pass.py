@@ -92,6 +92,7 @@ class _Both:
     ) -> None:
         self._parts, self._written = parts, written
         self.shape = self.batch_size = torch.Size((2, *parts[0].batch_size))
+        self.device = parts[0].device
 
     def get(self, key: NestedKey, default: Tensor | None = None) -> Tensor | None:
         values = [

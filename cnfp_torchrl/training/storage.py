@@ -9,7 +9,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import PackedStates, SampledGeometry, constraints_to_sample
-from cnfp_torchrl.envs.geometry_transform import CONSTRAINTS_KEY
+from cnfp_torchrl.keys import ACTION_KEY, CONSTRAINTS_KEY
 
 
 def prepare_buffer(
@@ -40,4 +40,4 @@ def prepare_buffer(
     if computed.field_keys:
         buffer.append_transform(computed)
     outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
-    return [*state, "action", *outcome, *other_keys]
+    return [*state, ACTION_KEY, *outcome, *other_keys]
