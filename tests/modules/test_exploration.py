@@ -1,4 +1,4 @@
-"""TorchRL's own exploration and repeated actions, which know nothing of constraints, are refused."""
+"""Exploration and repeated actions of TorchRL, which know no constraints, are refused."""
 
 from collections.abc import Callable
 from typing import Any
