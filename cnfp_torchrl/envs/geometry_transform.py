@@ -45,8 +45,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
     All states' sets are of one family.
 
     Args:
-        name: the constraint's name, by which flow and order refer to it.
-        in_keys: what `constraint_set` reads; refused when not finite.
+        name: The constraint's name, by which flow and order refer to it.
+        in_keys: The keys of what `constraint_set` reads; refused where not finite.
 
     Raises:
         ValueError: for a bad or reserved name.

@@ -24,8 +24,8 @@ class SampledGeometry(Transform):
     are to be stored.
 
     Args:
-        env: the environment whose transforms publish the sets.
-        names: of the constraints whose sets are computed.
+        env: The environment whose transforms publish the sets.
+        names: The names of the constraints whose sets are computed.
 
     Raises:
         KeyError: for a name that none of the environment's geometry transforms has.
@@ -68,9 +68,9 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
     always are.
 
     Args:
-        env: the environment whose transforms publish the geometry.
-        keys: what the actor reads of a state.
-        limit: bytes of a stored transition that may be for constraints.
+        env: The environment whose transforms publish the geometry.
+        keys: The keys that the actor reads of a state.
+        limit: The bytes of a stored transition that may be for constraints.
     """
     spec = env.observation_spec
     sizes = {
