@@ -1,8 +1,16 @@
 """Sets of allowed actions and their intersections: containment, slack, gauges, centres."""
 
+from cnfp_torchrl.geometry.anchor import (
+    LEEWAY,
+    Anchored,
+    attempt_anchor,
+    chebyshev_center,
+    lexicographic_anchor,
+    relaxation_floor,
+    row_depths,
+)
 from cnfp_torchrl.geometry.ball import Ball
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.centres import MINIMUM_SLACK, chebyshev_centre, lexicographic_centre
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, GeometryError
 from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
@@ -17,7 +25,8 @@ from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
 
 __all__ = [
     "EROSION_IN_EPS",
-    "MINIMUM_SLACK",
+    "LEEWAY",
+    "Anchored",
     "Ball",
     "Box",
     "Cone",
@@ -34,8 +43,11 @@ __all__ = [
     "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
-    "chebyshev_centre",
-    "lexicographic_centre",
+    "attempt_anchor",
+    "chebyshev_center",
+    "lexicographic_anchor",
     "project",
     "project_onto_intersection",
+    "relaxation_floor",
+    "row_depths",
 ]

@@ -48,7 +48,7 @@ class Ball(ConstraintSet):
 
     Args:
         center: ``(*batch, d)``.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -57,7 +57,7 @@ class Ball(ConstraintSet):
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 0}
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
         yield "center", self.center.isinf(), "a finite center"
 
     def contains(self, action: Tensor) -> Tensor:
@@ -76,6 +76,13 @@ class Ball(ConstraintSet):
     def bounding_box(self) -> Box:
         radius = self.radius.unsqueeze(-1)
         return Box(self.center - radius, self.center + radius, validate_args=False)
+
+    def inflated(self, by: Tensor) -> Self:
+        return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * (self.radius + vector_norm(self.center, dim=-1))).unsqueeze(-1)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps

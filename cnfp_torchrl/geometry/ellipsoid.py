@@ -72,12 +72,20 @@ class Ellipsoid(ConstraintSet):
         half = vector_norm(self.scale_tril, dim=-1)
         return Box(self.center - half, self.center + half, validate_args=False)
 
+    def inflated(self, by: Tensor) -> Self:
+        share = 1 + by.squeeze(-1) * self._inverse_norm()
+        return type(self)(
+            self.center, self.scale_tril * share[..., None, None], validate_args=False
+        )
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        return (EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size()).unsqueeze(-1)
+
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = vector_norm(self.scale_tril, dim=(-2, -1)) + vector_norm(self.center, dim=-1)
-        # An ellipsoid thinner than its rounding error must not turn inside out: what is left of it
-        # has no slack to speak of, so that it is dropped like an empty set.
-        share = (1 - eps * size * self._inverse_norm()).clamp(min=eps)
+        # An ellipsoid thinner than its rounding error must not turn inside out. In a region it was
+        # inflated by more than that.
+        share = (1 - eps * self._size() * self._inverse_norm()).clamp(min=eps)
         return type(self)(
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
@@ -90,6 +98,9 @@ class Ellipsoid(ConstraintSet):
         inverse = solve_triangular(self.scale_tril, self._identity(), upper=False)
         rate = self._inverse_norm()
         return Cone(inverse, -self.whiten(self.center), torch.ones_like(rate), rate)
+
+    def _size(self) -> Tensor:
+        return vector_norm(self.scale_tril, dim=(-2, -1)) + vector_norm(self.center, dim=-1)
 
     def _identity(self) -> Tensor:
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)

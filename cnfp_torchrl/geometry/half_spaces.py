@@ -22,7 +22,8 @@ class HalfSpaces(ConstraintSet):
 
     It need not be bounded. A control barrier function gives one row,
     :math:`-L_g h \cdot a \le L_f h + \alpha(h)`. A row whose normal is zero lets every action pass
-    where its offset is 0 or more, and none where it is less: there the constraint cannot hold.
+    where its offset is 0 or more, and none where it is less: there it is relaxed by as much. Rows
+    are relaxed one by one, each by a distance.
 
     Args:
         normals: ``(*batch, m, d)``, finite.
@@ -52,8 +53,16 @@ class HalfSpaces(ConstraintSet):
         return (_rows(self.normals.double(), action.double()) <= self.offsets.double()).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
+        return self.row_slacks(action).amin(-1)
+
+    def row_slacks(self, action: Tensor) -> Tensor:
+        """Return the distances to the rows' boundaries, ``(*batch, m)``."""
         offsets, lengths = self._offsets_and_lengths()
-        return ((offsets - _rows(self.normals, action)) / lengths).amin(-1)
+        return (offsets - _rows(self.normals, action)) / lengths
+
+    def inflated(self, by: Tensor) -> Self:
+        lengths = self._offsets_and_lengths()[1]
+        return type(self)(self.normals, self.offsets + by * lengths, validate_args=False)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
         return self.gauge_about(centre)(direction)
@@ -72,10 +81,18 @@ class HalfSpaces(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
-        size = self.normals.abs().sum(-1) * largest.unsqueeze(-1) + self.offsets.abs()
-        offsets = torch.where(self.offsets.isinf(), self.offsets, self.offsets - eps * size)
+        offsets = self.offsets - eps * self._size(magnitude)
+        offsets = torch.where(self.offsets.isinf(), self.offsets, offsets)
         return type(self)(self.normals, offsets, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        lengths = self._offsets_and_lengths()[1]
+        moved = EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size(magnitude) / lengths
+        return moved.masked_fill(self.offsets.isinf(), 0)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
+        return self.normals.abs().sum(-1) * largest.unsqueeze(-1) + self.offsets.abs()
 
     def around(self, centre: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])

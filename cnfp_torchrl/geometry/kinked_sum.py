@@ -20,11 +20,12 @@ from cnfp_torchrl.geometry.superlevel import KinkedSum
 class KinkedSumBound(ConstraintSet):
     r"""The set :math:`\{a : \sum_i \max(\alpha_i a_i, \beta_i a_i) \le bound\}`.
 
-    With :math:`\alpha_i \ge 0 \ge \beta_i`, which a family derives from its weights. Contains 0.
+    With :math:`\alpha_i \ge 0 \ge \beta_i`, which a family derives from its weights. Contains 0,
+    and nothing in the free components' place if the bound is 0.
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, positive and finite.
+        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
     """
 
     weights: Tensor
@@ -39,14 +40,21 @@ class KinkedSumBound(ConstraintSet):
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "weights", self.weights.isinf(), "a finite weight"
-        yield "bound", (self.bound <= 0) | self.bound.isinf(), "a finite bound > 0"
+        yield "bound", (self.bound < 0) | self.bound.isinf(), "a finite bound >= 0"
 
     def contains(self, action: Tensor) -> Tensor:
         return self._total(self.weights.double(), action.double()) <= self.bound.double()
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(bound - sum) / |weights|``; infinite where all weights are zero."""
-        return (self.bound - self._total(self.weights, action)) / vector_norm(self.weights, dim=-1)
+        lengths = vector_norm(self.weights, dim=-1)
+        free = lengths == 0
+        slack = (self.bound - self._total(self.weights, action)) / lengths.masked_fill(free, 1)
+        return slack.masked_fill(free, torch.inf)
+
+    def inflated(self, by: Tensor) -> Self:
+        bound = self.bound + by.squeeze(-1) * vector_norm(self.weights, dim=-1)
+        return type(self)(self.weights, bound, validate_args=False)
 
     def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
         r"""Return the gauge about a centre, in O(d log d).
@@ -58,6 +66,8 @@ class KinkedSumBound(ConstraintSet):
         """
         side = self._side_at_exit(direction.detach(), centre.detach())
         room = self.bound - (side * centre).sum(-1)
+        # Without weights the set has no end, and a bound of 0 leaves no room to divide by.
+        room = room.masked_fill((self.weights == 0).all(-1), 1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
     def bounding_box(self) -> Box:

@@ -28,7 +28,7 @@ class TaskSpaceBall(ConstraintSet):
     Args:
         jacobian: J, ``(*batch, m, d)``, finite.
         offset: b, ``(*batch, m)``, finite.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -40,7 +40,7 @@ class TaskSpaceBall(ConstraintSet):
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "jacobian", self.jacobian.isinf(), "finite elements"
         yield "offset", self.offset.isinf(), "a finite offset"
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
 
     def shape_problem(self) -> str | None:
         rows, components = self.jacobian.shape[-2], self.offset.shape[-1]
@@ -76,11 +76,21 @@ class TaskSpaceBall(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        radius = torch.sub(self.radius, self._size(magnitude), alpha=eps)
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * self._size(magnitude) / self._norm()).unsqueeze(-1)
+
+    def inflated(self, by: Tensor) -> Self:
+        radius = self.radius + by.squeeze(-1) * self._norm()
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
         terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
-        size = self.radius + vector_norm(terms, dim=-1)
-        radius = torch.sub(self.radius, size, alpha=eps)
-        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+        return self.radius + vector_norm(terms, dim=-1)
 
     def around(self, centre: Tensor, radius: Tensor) -> Self:
         offset = -_image(self.jacobian, centre)

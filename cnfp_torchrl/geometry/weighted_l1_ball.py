@@ -20,7 +20,7 @@ class WeightedL1Ball(KinkedSumBound):
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, positive and finite.
+        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
     """
 
     @staticmethod

@@ -47,7 +47,8 @@ class Distances(NamedTuple):
 class Program:
     """B problems "maximise t such that all sets have slack t", as stacks of rows, cones and sums.
 
-    Fields carry B first; each kind has a weight of 1, or of 0 where it is to be ignored.
+    Fields carry B first; each inequality has a weight of 1, or of 0 where it is to be ignored, and
+    a rate of 0 where it must hold whatever t is.
     """
 
     rows: Tensor
@@ -66,20 +67,18 @@ class Program:
     sum_weights: Tensor
 
     @classmethod
-    def stack(cls, parts: Sequence[Superlevel], active: Tensor) -> Self:
-        """Stack descriptions, each with batch shape ``(B,)``, of which some are active.
+    def stack(cls, parts: Sequence[Superlevel], batch: int) -> Self:
+        """Stack descriptions, each with batch shape ``(B,)``: all rows, all cones, all sums.
 
         Args:
-            parts: one description for each set.
-            active: boolean ``(B, len(parts))``.
+            parts: one description for each set, at least one of them with rows.
+            batch: B.
         """
-        batch, like = active.shape[0], active.new_zeros((), dtype=torch.float64)
-        flags = active.to(like).unsqueeze(-1).unbind(1)
-        rows = [(p, on) for p, on in zip(parts, flags, strict=True) if isinstance(p, Rows)]
-        cones = [(p, on) for p, on in zip(parts, flags, strict=True) if isinstance(p, Cone)]
-        sums = [(p, on) for p, on in zip(parts, flags, strict=True) if isinstance(p, KinkedSum)]
-        dim = rows[0][0].normals.shape[-1]
-        height = max((p.matrix.shape[-2] for p, _ in cones), default=0)
+        rows = [part for part in parts if isinstance(part, Rows)]
+        cones = [part for part in parts if isinstance(part, Cone)]
+        sums = [part for part in parts if isinstance(part, KinkedSum)]
+        like, dim = rows[0].normals, rows[0].normals.shape[-1]
+        height = max((part.matrix.shape[-2] for part in cones), default=0)
 
         def joined(pieces: list[Tensor], *shape: int) -> Tensor:
             """Concatenate pieces ``(*B, ...)`` along their first event dimension."""
@@ -88,40 +87,66 @@ class Program:
             sizes = [piece.shape[-1 - len(shape) :] for piece in pieces]
             return torch.cat([p.expand(batch, *n) for p, n in zip(pieces, sizes, strict=True)], 1)
 
-        offsets = joined([p.offsets for p, _ in rows])
+        offsets = joined([p.offsets for p in rows])
         finite = offsets.isfinite()
+        cone_rates = joined([p.rate[..., None] for p in cones])
+        sum_rates = joined([p.rate[..., None] for p in sums])
         return cls(
-            rows=joined([p.normals for p, _ in rows], dim),
+            rows=joined([p.normals for p in rows], dim),
             row_offsets=torch.where(finite, offsets, 1.0),
-            row_rates=joined([p.rates for p, _ in rows]),
-            row_weights=finite * joined([on.expand(batch, p.offsets.shape[-1]) for p, on in rows]),
+            row_rates=joined([p.rates for p in rows]),
+            row_weights=finite.to(like),
             matrices=joined(
-                [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p, _ in cones], height, dim
+                [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p in cones], height, dim
             ),
-            vectors=joined(
-                [_rows_padded(p.vector, height, -1)[..., None, :] for p, _ in cones], height
-            ),
-            cone_sizes=joined([p.size[..., None] for p, _ in cones]),
-            cone_rates=joined([p.rate[..., None] for p, _ in cones]),
-            cone_weights=joined([on for _, on in cones]),
-            upper=joined([torch.maximum(p.upper, p.lower)[..., None, :] for p, _ in sums], dim),
-            lower=joined([torch.minimum(p.upper, p.lower)[..., None, :] for p, _ in sums], dim),
-            sum_sizes=joined([p.size[..., None] for p, _ in sums]),
-            sum_rates=joined([p.rate[..., None] for p, _ in sums]),
-            sum_weights=joined([on for _, on in sums]),
+            vectors=joined([_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height),
+            cone_sizes=joined([p.size[..., None] for p in cones]),
+            cone_rates=cone_rates,
+            cone_weights=torch.ones_like(cone_rates),
+            upper=joined([torch.maximum(p.upper, p.lower)[..., None, :] for p in sums], dim),
+            lower=joined([torch.minimum(p.upper, p.lower)[..., None, :] for p in sums], dim),
+            sum_sizes=joined([p.size[..., None] for p in sums]),
+            sum_rates=sum_rates,
+            # Without weights every action passes.
+            sum_weights=(sum_rates > 0).to(like),
+        )
+
+    def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
+        """Return the problems "maximise t such that all slacks exceed what is required by t".
+
+        Args:
+            required: slacks ``(B, M)`` of all inequalities, in their order.
+            trial: which of them exceed it by t, 1 or 0; the others need no more than the required.
+            counts: which of them count at all, 1 or 0.
+        """
+        sizes = [self.row_rates.shape[-1], self.cone_rates.shape[-1], self.sum_rates.shape[-1]]
+        needs, trials, on = (each.split(sizes, -1) for each in (required, trial, counts))
+        return replace(
+            self,
+            row_offsets=self.row_offsets - self.row_rates * needs[0],
+            row_rates=self.row_rates * trials[0],
+            row_weights=self.row_weights * on[0],
+            cone_sizes=self.cone_sizes - self.cone_rates * needs[1],
+            cone_rates=self.cone_rates * trials[1],
+            cone_weights=self.cone_weights * on[1],
+            sum_sizes=self.sum_sizes - self.sum_rates * needs[2],
+            sum_rates=self.sum_rates * trials[2],
+            sum_weights=self.sum_weights * on[2],
         )
 
     def select(self, keep: Tensor) -> Self:
         """Return some of the B problems."""
         return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
-    def with_rows(self, normals: Tensor, offsets: Tensor, weights: Tensor) -> Self:
-        """Return the problems with rows ``(B, m, d)``, of rate one, added."""
+    def with_rows(
+        self, normals: Tensor, offsets: Tensor, rates: Tensor, weights: Tensor
+    ) -> Self:
+        """Return the problems with rows ``(B, m, d)`` added."""
         return replace(
             self,
             rows=torch.cat([self.rows, normals], 1),
             row_offsets=torch.cat([self.row_offsets, offsets], 1),
-            row_rates=torch.cat([self.row_rates, torch.ones_like(offsets)], 1),
+            row_rates=torch.cat([self.row_rates, rates], 1),
             row_weights=torch.cat([self.row_weights, weights], 1),
         )
 

@@ -1,6 +1,6 @@
 """A batched interior-point method for the largest smallest slack of several convex sets.
 
-Path-following with the logarithmic barrier: for growing eta, Newton's method minimises
+Path-following with the logarithmic barrier: for growing eta, Newton's method minimizes
 ``-eta t + barrier(a, t)``. Every iterate is strictly feasible, so its slack is a lower bound of the
 best one; a small Newton decrement certifies an upper bound (Nesterov, Introductory Lectures on
 Convex Optimization, 2004, theorem 4.2.7).
@@ -8,20 +8,18 @@ Convex Optimization, 2004, theorem 4.2.7).
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from typing import NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.slack_program import Distances, Point, Program, weigh
+from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program, weigh
 
-MAX_ITERATIONS = 1000
-"""Newton steps before the method gives up with an error; some 20 are usual, 100 rare."""
+MAX_ITERATIONS = 150
+"""Newton steps after which the best point so far must do; some 15 are usual, 50 rare."""
 
-RELATIVE_GAP = 1e-9
-"""How close bounds of the best slack come, relative to the scale, before they count as equal."""
-
-_GROWTH = 5.0
+_GROWTH = 8.0
 _TRIALS = 8
 
 
@@ -33,35 +31,40 @@ class Best(NamedTuple):
     upper_bound: Tensor
 
 
-def maximise_slack(
-    problem: Program, start: Tensor, scale: Tensor, enough: float, share: float
-) -> Best:
+Settled: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""From lower and upper bounds of the best t, and the problems' indices: which need no more work."""
+
+
+def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Settled) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
-    Stops for each problem as soon as the slack is at least `enough` and a share of the upper bound,
-    or the upper bound is below `enough`: at once where a set is so far from the bounds that its
-    Lipschitz slack says so, which Newton's method could not tell from rounding error.
+    Stops for each problem as soon as its bounds say enough: at once where a set is so far from the
+    bounds that its Lipschitz slack does, which Newton's method could not tell from rounding error.
+    Where rounding error keeps the bounds apart, the best point so far is returned: its slack is
+    true, and no more is claimed for the upper bound.
 
     Args:
         problem: B problems in float64, with rows that bound the actions on all sides.
-        start: the middles of these bounds, ``(B, d)``.
-        scale: the mean widths of these bounds, ``(B,)``.
-        enough: the smallest slack of interest.
-        share: the share of the best slack that will do, below 1.
-
-    Raises:
-        RuntimeError: when a problem is undecided after `MAX_ITERATIONS`.
+        start: points strictly inside of the inequalities of rate 0, ``(B, d)``.
+        scale: the mean widths of the bounds, ``(B,)``.
+        settled: tells which problems need no more work.
     """
     at = problem.start(start, scale)
-    # Half of the bounds' diagonal at most; outside of the bounds the slack is negative.
-    reach = scale * start.shape[-1] / 2
-    upper_bound = problem.bound_within(start, reach).clamp(min=0)
+    # The bounds' diagonal at most; outside of the bounds nothing is feasible.
+    upper_bound = problem.bound_within(start, scale * start.shape[-1])
     found = Best(start.clone(), problem.slack(start), upper_bound)
     # The eta for which the start is best in t.
     eta = _pull_on_slack(problem, at)
     nu = problem.barrier_parameter()
     left = torch.arange(len(start), device=start.device)
     for _ in range(MAX_ITERATIONS):
+        undecided = ~settled(found.slack[left], found.upper_bound[left], left)
+        if not bool(undecided.all()):
+            if not bool(undecided.any()):
+                break
+            problem, left = problem.select(undecided), left[undecided]
+            nu, eta = nu[undecided], eta[undecided]
+            at = Point(*(each[undecided] for each in at))
         move, squared = newton(problem, at, eta)
         # The absolute value, because a negative one is all rounding error.
         decrement = squared.abs().sqrt()
@@ -73,27 +76,9 @@ def maximise_slack(
         found.action[left] = torch.where(better.unsqueeze(-1), at.action, found.action[left])
         found.slack[left] = torch.where(better, slack, found.slack[left])
         found.upper_bound[left] = torch.minimum(found.upper_bound[left], upper)
-        lower, upper = found.slack[left], found.upper_bound[left]
-        undecided = ~is_settled(lower, upper, scale[left], enough, share)
-        if not bool(undecided.any()):
-            return found
         at = _line_search(problem, at, move, eta, decrement)
         eta = torch.where(near, eta * _GROWTH, eta)
-        if not bool(undecided.all()):
-            problem, left = problem.select(undecided), left[undecided]
-            nu, eta = nu[undecided], eta[undecided]
-            at = Point(*(each[undecided] for each in at))
-    raise RuntimeError(
-        f"{len(left)} of {len(start)} intersections undecided after {MAX_ITERATIONS} Newton steps; "
-        f"the first has slack {found.slack[left][0]:.3g}, at most {found.upper_bound[left][0]:.3g}"
-    )
-
-
-def is_settled(lower: Tensor, upper: Tensor, scale: Tensor, enough: float, share: float) -> Tensor:
-    """Tell whether bounds of the best slack say all that is asked, or cannot come much closer."""
-    gap = upper - lower
-    deep = (lower >= enough) & (gap <= (1 - share) * upper.abs())
-    return upper.isfinite() & ((upper < enough) | deep | (gap <= RELATIVE_GAP * scale))
+    return found
 
 
 def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
@@ -210,10 +195,13 @@ def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decremen
 def _solve(hessian: Tensor, right: Tensor) -> Tensor:
     """Solve with a positive definite matrix, scaled to a unit diagonal."""
     scale = hessian.diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor, failed = torch.linalg.cholesky_ex(hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2))
+    scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    factor, failed = torch.linalg.cholesky_ex(scaled)
     if bool(failed.any()):
-        # Rounding made the matrix indefinite; a shift of that size gives a descent direction.
-        shift = 1e-12 * torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        factor = torch.linalg.cholesky(hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2) + shift)
+        # Rounding made the matrix indefinite; a shift of that size gives a descent direction, and
+        # where not even that helps, the diagonal does.
+        identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+        factor, failed = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
+        factor = torch.where((failed > 0)[:, None, None], identity, factor)
     right = (right * scale).unsqueeze(-1)
-    return torch.cholesky_solve(right, factor).squeeze(-1) * scale
+    return (torch.cholesky_solve(right, factor).squeeze(-1) * scale).nan_to_num()
