@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.attempts import attempt_anchor
+from cnfp_torchrl.geometry.anchor.attempts import first_attempt, further_attempt
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
 from cnfp_torchrl.geometry.anchor.interior_point import Best
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
@@ -29,6 +29,9 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 LEEWAY = 1e-3
 """By how much relaxed rows give way beyond the least amount, as a share of the bounds' width."""
+
+ATTEMPTS = (3, 3, 4)
+"""Steps inwards between looks at which states need more of them."""
 
 @torch.no_grad()
 def lexicographic_anchor(
@@ -59,30 +62,35 @@ def lexicographic_anchor(
     if not leeway > 0:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
     bounds = bounds_of(sets)
-    anchor, decided = attempt_anchor(sets, candidate)
     depths = row_depths(sets)
-    shape = decided.shape
-    relaxation = [torch.zeros_like(each).expand(*shape, each.shape[-1]) for each in depths]
-    active = decided.unsqueeze(-1).expand(*shape, len(sets))
-    if bool(decided.all()):
-        return Anchored(anchor, active.clone(), tuple(relaxation))
-    index = (~decided).flatten().nonzero().squeeze(-1)
-    dim = anchor.shape[-1]
-    search = Search.of(
-        [each.select(shape, index) for each in sets],
-        torch.cat([_flat(each, shape)[index] for each in depths], -1),
-        leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[index].squeeze(-1),
-    )
-    found = search.run()
-    amounts = [
-        _flat(each, shape).index_copy(0, index, rows.to(each)).view(*shape, -1)
-        for each, rows in zip(relaxation, found.relaxation, strict=True)
-    ]
-    return Anchored(
-        anchor.reshape(-1, dim).index_copy(0, index, found.anchor.to(anchor)).view(*shape, dim),
-        active.reshape(-1, len(sets)).index_copy(0, index, found.active).view(*shape, -1),
-        tuple(amounts),
-    )
+    found = first_attempt(sets, depths, candidate)
+    shape, dim = found.decided.shape, found.anchor.shape[-1]
+    anchor = found.anchor.expand(*shape, dim).reshape(-1, dim)
+    active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
+    relaxation = [each.new_zeros(*shape, each.shape[-1]) for each in depths]
+    left = (~found.decided).flatten().nonzero().squeeze(-1)
+    if len(left):
+        found = found.select(left)
+        sets = [each.select(shape, left) for each in sets]
+        depths = [_flat(each, shape)[left] for each in depths]
+        margin = (leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left]).squeeze(-1)
+    # Steps inwards for the states that need them, and the search for those that need more.
+    for steps in ATTEMPTS:
+        if not len(left):
+            break
+        found = further_attempt(sets, depths, found, steps)
+        anchor = anchor.index_copy(0, left, found.anchor)
+        hard = (~found.decided).nonzero().squeeze(-1)
+        sets = [each.select(found.decided.shape, hard) for each in sets]
+        depths = [each[hard] for each in depths]
+        found, left, margin = found.select(hard), left[hard], margin[hard]
+    if len(left):
+        searched = Search.of(sets, torch.cat(depths, -1), margin).run()
+        anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
+        active.view(-1, len(sets)).index_copy_(0, left, searched.active)
+        for each, rows in zip(relaxation, searched.relaxation, strict=True):
+            each.view(-1, each.shape[-1]).index_copy_(0, left, rows.to(each))
+    return Anchored(anchor.view(*shape, dim), active, tuple(relaxation))
 
 
 def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:
