@@ -15,8 +15,7 @@ from cnfp_torchrl.envs.geometry_transform import (
     GeometryTransform,
     appended_transforms,
 )
-from cnfp_torchrl.geometry import Box, GeometryError
-from cnfp_torchrl.geometry.centres import lexicographic_centre
+from cnfp_torchrl.geometry import Box, GeometryError, lexicographic_anchor
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
 from cnfp_torchrl.modules.flow_module import action_bounds
 
@@ -109,7 +108,7 @@ class ConstraintCentre(Transform):
     Reads the sets that the geometry transforms before it publish, and a candidate at
     ``("constraints", "safe_action")`` if there is one: a known safe action makes the centre cheap.
     It is checked; where it fails, the general method decides
-    (`cnfp_torchrl.geometry.centres.lexicographic_centre`).
+    (`cnfp_torchrl.geometry.lexicographic_anchor`).
 
     Writes ``("constraints", "centre")``, ``(*batch, d)``, and ``("constraints", NAME, "active")``,
     boolean ``(*batch,)``, False where the constraint cannot hold together with those of higher
@@ -155,7 +154,7 @@ class ConstraintCentre(Transform):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        centre, active = lexicographic_centre([bounds, *sets], candidate)
+        centre, active, relaxation = lexicographic_anchor([bounds, *sets], candidate)
         batch = next_tensordict.batch_size
         next_tensordict.set(CENTRE_KEY, centre.expand(*batch, centre.shape[-1]))
         for stage, bijector in enumerate(self._bijectors, start=1):

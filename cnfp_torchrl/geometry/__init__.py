@@ -1,6 +1,7 @@
 """Sets of allowed actions and their intersections: containment, slack, gauges, centres."""
 
 from cnfp_torchrl.geometry.anchor import (
+    DEPTH,
     LEEWAY,
     Anchored,
     attempt_anchor,
@@ -24,6 +25,7 @@ from cnfp_torchrl.geometry.visible_region import VisibleRegion
 from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
 
 __all__ = [
+    "DEPTH",
     "EROSION_IN_EPS",
     "LEEWAY",
     "Anchored",

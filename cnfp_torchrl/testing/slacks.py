@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry import (
-    MINIMUM_SLACK,
     Cone,
     ConstraintSet,
     KinkedSum,
     Rows,
     Superlevel,
-    lexicographic_centre,
+    lexicographic_anchor,
+    row_depths,
 )
 from cnfp_torchrl.testing.example import Example
 from cnfp_torchrl.testing.family_error import FamilyError, called, require
@@ -155,10 +155,14 @@ def check_search_keeps_the_set(example: Example) -> None:
     """The search for centres keeps the set wherever the given centre has slack enough."""
     sets, bounds, centre = example.sets, example.bounds, example.views[0].centre
     method = "slack" if sets.superlevel() is None else "superlevel"
-    twice = [each.eroded(example.size).eroded(example.size) for each in (bounds, sets)]
-    slack = torch.minimum(*(each.slack(centre) for each in twice))
-    _, active = called(type(sets), method, lambda: lexicographic_centre([bounds, sets]))
-    kept = active[..., 1] | (slack < 2 * MINIMUM_SLACK)
+    depths = row_depths([bounds, sets])
+    rooms = [
+        (each.row_slacks(centre) - 2 * depth).amin(-1)
+        for each, depth in zip((bounds, sets), depths, strict=True)
+    ]
+    slack = torch.minimum(*rooms)
+    found = called(type(sets), method, lambda: lexicographic_anchor([bounds, sets]))
+    kept = found.active[..., 1] | (slack < 0)
     expected = "the search for centres to keep the set wherever a centre has slack enough"
     require(sets, method, kept, expected, "a slack of", slack, centre=centre)
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from cnfp_torchrl.geometry.anchor.depth import row_depths
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 STEPS = 6
 """Steps inwards: more decide tighter states, which the search takes otherwise."""
@@ -44,7 +45,7 @@ def attempt_anchor(
     found = first_attempt(sets, depths, candidate)
     if steps:
         found = further_attempt(sets, depths, found, steps)
-    return found.anchor.expand(*found.decided.shape, -1), found.decided
+    return found.anchor, found.decided
 
 
 class Attempt(NamedTuple):
@@ -58,7 +59,7 @@ class Attempt(NamedTuple):
         """Return some of the batch elements, by their flat indices."""
         shape, dim = self.decided.shape, self.anchor.shape[-1]
         return Attempt(
-            self.anchor.expand(*shape, dim).reshape(-1, dim)[index],
+            self.anchor.reshape(-1, dim)[index],
             self.upper.expand(shape).reshape(-1)[index],
             self.decided.reshape(-1)[index],
         )
@@ -83,17 +84,17 @@ def further_attempt(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt, steps: int
 ) -> Attempt:
     """Go on with some steps inwards."""
-    start = before.anchor.expand(*before.decided.shape, -1)
-    ascent = Ascent(sets, start, before.upper)
+    ascent = Ascent(sets, before.anchor, before.upper)
     ascent.run(steps)
-    return _roomiest(sets, depths, [ascent.point, start], ascent.bound)
+    return _roomiest(sets, depths, [ascent.point, before.anchor], ascent.bound)
 
 
 def _roomiest(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
     """Choose those of some points that have most slack beyond the depth."""
-    stacked = torch.stack(torch.broadcast_tensors(*points))
+    shape = broadcast_shape(*(each.batch_shape for each in sets), *(p.shape[:-1] for p in points))
+    stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
     slacks = [each.row_slacks(stacked) for each in sets]
     rooms = [(slack - depth).amin(-1) for slack, depth in zip(slacks, depths, strict=True)]
     room, slack = (
@@ -102,6 +103,5 @@ def _roomiest(
     )
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
-    stacked = stacked.expand(len(points), *room.shape[1:], stacked.shape[-1])
     anchor = stacked.take_along_dim(best.unsqueeze(-1), 0).squeeze(0)
     return Attempt(anchor, upper, (room.squeeze(0) >= 0) & (slack >= SHARE * upper))

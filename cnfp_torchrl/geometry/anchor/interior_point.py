@@ -198,10 +198,11 @@ def _solve(hessian: Tensor, right: Tensor) -> Tensor:
     scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
     factor, failed = torch.linalg.cholesky_ex(scaled)
     if bool(failed.any()):
-        # Rounding made the matrix indefinite; a shift of that size gives a descent direction, and
+        # Rounding made a matrix indefinite; a shift of that size gives a descent direction, and
         # where not even that helps, the diagonal does.
         identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        factor, failed = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
-        factor = torch.where((failed > 0)[:, None, None], identity, factor)
+        shifted, hopeless = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
+        shifted = torch.where((hopeless > 0)[:, None, None], identity, shifted)
+        factor = torch.where((failed > 0)[:, None, None], shifted, factor)
     right = (right * scale).unsqueeze(-1)
     return (torch.cholesky_solve(right, factor).squeeze(-1) * scale).nan_to_num()

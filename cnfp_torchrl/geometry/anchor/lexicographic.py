@@ -65,7 +65,7 @@ def lexicographic_anchor(
     depths = row_depths(sets)
     found = first_attempt(sets, depths, candidate)
     shape, dim = found.decided.shape, found.anchor.shape[-1]
-    anchor = found.anchor.expand(*shape, dim).reshape(-1, dim)
+    anchor = found.anchor.reshape(-1, dim)
     active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
     relaxation = [each.new_zeros(*shape, each.shape[-1]) for each in depths]
     left = (~found.decided).flatten().nonzero().squeeze(-1)
@@ -117,8 +117,8 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
 
     Args:
         sets: sets of batch shape ``(B,)``, the first a finite box.
-        share: the share of the best slack that will do, below 1; where that is negative, of the
-            bounds' width how close to it the slack comes is the rest.
+        share: the share of the best slack that will do, below 1; where the best slack is negative
+            the one found is at most that much lower.
 
     Returns:
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
@@ -132,8 +132,9 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
     width = smallest_width(everything.bounds)
 
     def settled(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
-        size = torch.where(lower > 0, upper, width[index])
-        return (upper - lower <= (1 - share) * size) | (upper - lower <= 1e-9 * width[index])
+        gap, decided = upper - lower, (lower > 0) | (upper < 0)
+        close = gap <= (1 - share) * torch.maximum(upper, -lower)
+        return (decided & close) | (gap <= 1e-9 * width[index])
 
     return everything.maximize(torch.zeros_like(rows, dtype=middle.dtype), rows, rows, middle, settled)
 
