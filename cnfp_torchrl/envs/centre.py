@@ -15,7 +15,7 @@ from cnfp_torchrl.envs.geometry_transform import (
     GeometryTransform,
     appended_transforms,
 )
-from cnfp_torchrl.geometry import Box, GeometryError, lexicographic_anchor
+from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, lexicographic_anchor
 from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, ConstraintBijector, in_order
 from cnfp_torchrl.modules.flow_module import action_bounds
 
@@ -110,14 +110,21 @@ class ConstraintCentre(Transform):
     It is checked; where it fails, the general method decides
     (`cnfp_torchrl.geometry.lexicographic_anchor`).
 
-    Writes ``("constraints", "centre")``, ``(*batch, d)``, and ``("constraints", NAME, "active")``,
-    boolean ``(*batch,)``, False where the constraint cannot hold together with those of higher
-    priority.
+    Writes ``("constraints", "centre")``, ``(*batch, d)``, and of each constraint
+
+    - ``("constraints", NAME, "active")``, boolean ``(*batch,)``: False where it cannot hold together
+      with those of higher priority,
+    - ``("constraints", NAME, "relaxation")``, ``(*batch,)``: by how much it is widened there, in
+      units of its slack; 0 where it is active, infinite where it had to be dropped,
+    - ``("constraints", NAME, "row_relaxation")``, ``(*batch, m)``: the same row by row, if its
+      family has rows.
 
     Args:
         bijectors: one for each constraint; they know where the geometry lies.
         order: the constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order. The same as the flow's.
+        leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
+            smallest width of the action bounds.
 
     Raises:
         TypeError: when a bijector is none, or the order is a string.
@@ -128,9 +135,13 @@ class ConstraintCentre(Transform):
     _high: Tensor | None
 
     def __init__(
-        self, bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None = None
+        self,
+        bijectors: Sequence[ConstraintBijector],
+        order: Sequence[str] | None = None,
+        leeway: float = LEEWAY,
     ) -> None:
         super().__init__()
+        self._leeway = leeway
         self._bijectors = in_order(bijectors, order)
         # Of the action bounds, read from the parent once; buffers, to move with the environment.
         self.register_buffer("_low", None, persistent=False)
@@ -154,11 +165,16 @@ class ConstraintCentre(Transform):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        centre, active, relaxation = lexicographic_anchor([bounds, *sets], candidate)
-        batch = next_tensordict.batch_size
-        next_tensordict.set(CENTRE_KEY, centre.expand(*batch, centre.shape[-1]))
+        found = lexicographic_anchor([bounds, *sets], candidate, self._leeway)
+        batch, largest = next_tensordict.batch_size, found.largest()
+        next_tensordict.set(CENTRE_KEY, found.anchor.expand(*batch, bounds.dim))
         for stage, bijector in enumerate(self._bijectors, start=1):
-            next_tensordict.set(bijector.active_key, active[..., stage].expand(batch))
+            next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))
+            next_tensordict.set(bijector.relaxation_key, largest[..., stage].expand(batch))
+            if bijector.row_relaxation_key is not None:
+                rows = found.relaxation[stage]
+                rows = rows.expand(*batch, rows.shape[-1])
+                next_tensordict.set(bijector.row_relaxation_key, rows)
         return next_tensordict
 
     def _reset(
@@ -177,6 +193,7 @@ class ConstraintCentre(Transform):
         """Add the centre and the flags."""
         assert isinstance(observation_spec, Composite)
         bounds, batch = self._action_bounds(), observation_spec.shape
+        state = observation_spec.zero()
         observation_spec[CENTRE_KEY] = Unbounded(
             (*batch, bounds.dim), dtype=bounds.dtype, device=observation_spec.device
         )
@@ -184,6 +201,14 @@ class ConstraintCentre(Transform):
             observation_spec[bijector.active_key] = Binary(
                 shape=batch, dtype=torch.bool, device=observation_spec.device
             )
+            observation_spec[bijector.relaxation_key] = Unbounded(
+                batch, dtype=bounds.dtype, device=observation_spec.device
+            )
+            if bijector.row_relaxation_key is not None:
+                slacks = bijector.get_set(state).row_slacks(bounds.low)
+                observation_spec[bijector.row_relaxation_key] = Unbounded(
+                    (*batch, slacks.shape[-1]), dtype=bounds.dtype, device=observation_spec.device
+                )
         return observation_spec
 
     def _action_bounds(self) -> Box:

@@ -30,7 +30,11 @@ class Box(ConstraintSet):
 
     def violations(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "low", self.low > self.high, "low <= high"
-        yield "low", (self.low == self.high) & self.low.isinf(), "low <= high, not the same infinity"
+        yield (
+            "low",
+            (self.low == self.high) & self.low.isinf(),
+            "low <= high, not the same infinity",
+        )
 
     def contains(self, action: Tensor) -> Tensor:
         return ((action >= self.low) & (action <= self.high)).all(-1)

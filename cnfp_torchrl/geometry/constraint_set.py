@@ -125,6 +125,11 @@ class ConstraintSet(ABC):
         """Tell whether the family states `inflated`."""
         return cls.inflated is not ConstraintSet.inflated
 
+    @classmethod
+    def has_rows(cls) -> bool:
+        """Tell whether sets of the family are made of several rows, see `row_slacks`."""
+        return cls.row_slacks is not ConstraintSet.row_slacks
+
     def row_slacks(self, action: Tensor) -> Tensor:
         """Return the slacks of the rows that a set is made of, ``(*batch, m)``; `slack` is the least.
 

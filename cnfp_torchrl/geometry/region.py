@@ -64,6 +64,19 @@ class Region:
         assert isinstance(bounds, Box)
         return bounds
 
+    def to(self, target: torch.dtype | torch.device | str) -> Self:
+        """Return the region in another floating dtype or on another device."""
+        active = self.active
+        if active is not None and not isinstance(target, torch.dtype):
+            active = active.to(target)
+        return type(self)(
+            tuple(each.with_fields(lambda value, _: value.to(target)) for each in self.sets),
+            self.centre.to(target),
+            active,
+            None if self.relaxation is None else tuple(each.to(target) for each in self.relaxation),
+            validate_args=False,
+        )
+
     def widened(self) -> tuple[ConstraintSet, ...]:
         """Return the sets, each widened by its relaxation; dropped ones as they are."""
         if self.relaxation is None:

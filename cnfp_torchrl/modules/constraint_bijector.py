@@ -94,6 +94,22 @@ class ConstraintBijector(TensorDictModuleBase):
         """Where `ConstraintCentre` says whether the constraint holds in a state."""
         return ("constraints", self.name, "active")
 
+    @property
+    def relaxation_key(self) -> NestedKey:
+        """Where `ConstraintCentre` says by how much the constraint had to be widened in a state."""
+        return ("constraints", self.name, "relaxation")
+
+    @property
+    def row_relaxation_key(self) -> NestedKey | None:
+        """Where it says so row by row, if the family has rows."""
+        return ("constraints", self.name, "row_relaxation") if self.set_type.has_rows() else None
+
+    @property
+    def anchor_keys(self) -> list[NestedKey]:
+        """All of what `ConstraintCentre` publishes of the constraint."""
+        rows = self.row_relaxation_key
+        return [self.active_key, self.relaxation_key, *([] if rows is None else [rows])]
+
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the sets of allowed actions; their values were checked when published.
 

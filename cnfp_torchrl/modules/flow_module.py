@@ -132,29 +132,35 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
         if self.flow.is_exact:
-            keys += [bijector.active_key for bijector in self.bijectors] + [CENTRE_KEY]
+            keys += [key for bijector in self.bijectors for key in bijector.anchor_keys]
+            keys += [CENTRE_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            MissingGeometryError: when geometry, centre or active flags are missing.
+            MissingGeometryError: when geometry, centre, active flags or relaxations are missing.
         """
         bounds = self.bounds
         if not self.flow.reads_constraints:
-            return self.flow(bounds, [], None, None)
+            return self.flow(bounds, [])
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
         if not self.flow.is_exact:
-            return self.flow(bounds, sets, None, None)
+            return self.flow(bounds, sets)
         centre = self._centre(tensordict).to(self.action_dtype)
-        return self.flow(bounds, sets, centre, self._active(tensordict))
+        relaxation = self._relaxation(tensordict)
+        return self.flow(bounds, sets, centre, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
-        """Return the region of allowed actions, for any flow; needs centre and active flags."""
+        """Return the region of allowed actions, for any flow; needs centre, flags, relaxations."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
-        centre, active = self._centre(tensordict), self._active(tensordict)
-        return Region((self.bounds, *sets), centre, active)
+        return Region(
+            (self.bounds, *sets),
+            self._centre(tensordict),
+            self._active(tensordict),
+            self._relaxation(tensordict),
+        )
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
@@ -192,6 +198,15 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             require(tensordict, bijector.active_key, _CENTRE_REMEDY) for bijector in self.bijectors
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
+
+    def _relaxation(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """Return by how much the rows of each set are widened, the bounds' by nothing."""
+        amounts = [self.low.new_zeros(())]
+        for bijector in self.bijectors:
+            rows = bijector.row_relaxation_key
+            amount = require(tensordict, rows or bijector.relaxation_key, _CENTRE_REMEDY)
+            amounts.append(amount if rows is not None else amount.unsqueeze(-1))
+        return tuple(amounts)
 
 
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):

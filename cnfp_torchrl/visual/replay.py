@@ -55,8 +55,7 @@ def replay_step(
 
 def in_float64(region: Region) -> Region:
     """Return a region in float64."""
-    sets = tuple(each.to(torch.float64) for each in region.sets)
-    return Region(sets, region.centre.double(), region.active, validate_args=False)
+    return region.to(torch.float64)
 
 
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:

@@ -62,7 +62,9 @@ def rows_of(each: ConstraintSet, index: int) -> Rows:
     def sums(a: Array) -> tuple[Array, Array]:
         terms = weights * a
         signs = np.sign(terms) if isinstance(each, WeightedL1Ball) else (terms > 0).astype(float)
-        return np.array([(bound - (signs * terms).sum()) / length]), -(signs * weights / length)[None]
+        return np.array([(bound - (signs * terms).sum()) / length]), -(signs * weights / length)[
+            None
+        ]
 
     return sums
 
@@ -142,19 +144,20 @@ class State:
                 constraints=[
                     {
                         "type": "ineq",
-                        "fun": lambda x: np.concatenate(
-                            [rooms(x[:dim])[0], rooms(x[:dim])[2] - x[dim]]
-                        )
-                        / scale,
-                        "jac": lambda x: np.concatenate(
-                            [
-                                np.pad(rooms(x[:dim])[1], ((0, 0), (0, 1))),
-                                np.pad(
-                                    rooms(x[:dim])[3], ((0, 0), (0, 1)), constant_values=-1.0
-                                ),
-                            ]
-                        )
-                        / scale,
+                        "fun": lambda x: (
+                            np.concatenate([rooms(x[:dim])[0], rooms(x[:dim])[2] - x[dim]]) / scale
+                        ),
+                        "jac": lambda x: (
+                            np.concatenate(
+                                [
+                                    np.pad(rooms(x[:dim])[1], ((0, 0), (0, 1))),
+                                    np.pad(
+                                        rooms(x[:dim])[3], ((0, 0), (0, 1)), constant_values=-1.0
+                                    ),
+                                ]
+                            )
+                            / scale
+                        ),
                     }
                 ],
                 options={"maxiter": 200, "ftol": 1e-13},

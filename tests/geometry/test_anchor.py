@@ -217,7 +217,7 @@ def test_a_candidate_decides_where_it_is_roomy() -> None:
     for candidate in (t(0.05, -0.6), t(0.0, -0.55)):
         anchor, decided = attempt_anchor(sets, candidate, steps=0)
         assert decided
-        assert min(each.slack(anchor) for each in sets) > 0.2
+        assert min(each.slack(anchor) for each in sets) > 0.18
     for candidate in (t(0.9, 0.9), t(torch.nan, 0.0)):
         _, decided = attempt_anchor(sets, candidate, steps=0)
         assert not decided
@@ -247,7 +247,9 @@ def test_the_anchor_does_not_depend_on_the_batch() -> None:
     assert 0.1 < found.active.double().mean() < 0.95
     for i in range(0, 60, 7):
         index = torch.tensor([i])
-        alone = lexicographic_anchor([BOUNDS, *(s.select(torch.Size([60]), index) for s in (rows, ball))])
+        alone = lexicographic_anchor(
+            [BOUNDS, *(s.select(torch.Size([60]), index) for s in (rows, ball))]
+        )
         torch.testing.assert_close(alone.anchor[0], found.anchor[i], rtol=1e-6, atol=1e-9)
         assert (alone.active[0] == found.active[i]).all()
         torch.testing.assert_close(alone.largest()[0], found.largest()[i], rtol=1e-6, atol=1e-9)

@@ -81,7 +81,9 @@ def test_what_is_required_is_kept() -> None:
         required = torch.tensor([[least] * 4 + [0.0]]).double()
         best = intersection.maximize(required, trial, counts, 0 * ones, close)
         assert best.slack.item() == pytest.approx(-1 - least, abs=1e-6)
-        torch.testing.assert_close(best.action, torch.tensor([[1 - least, 0.0]]).double(), rtol=0, atol=1e-3)
+        torch.testing.assert_close(
+            best.action, torch.tensor([[1 - least, 0.0]]).double(), rtol=0, atol=1e-3
+        )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

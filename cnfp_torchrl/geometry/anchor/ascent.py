@@ -145,7 +145,9 @@ class Ascent:
         inverse = (value - (least - gap)).reciprocal()
         above, below, rest = inverse.split([self.dim, self.dim, len(inverse) - 2 * self.dim])
         pull = self.half * (below - above)
-        gradient = torch.cat(gradients) if len(gradients) > 1 else (gradients or [value[:0, None]])[0]
+        gradient = (
+            torch.cat(gradients) if len(gradients) > 1 else (gradients or [value[:0, None]])[0]
+        )
         if gradients:
             pull = pull + (rest.unsqueeze(1) * gradient).sum(0)
         # What the weighted mean of the slacks may become within the bounds.

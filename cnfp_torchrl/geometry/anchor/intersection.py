@@ -96,9 +96,7 @@ class Intersection:
         """Return some of the B intersections."""
         shape = torch.Size([len(self.program.rows)])
         sets = [each.select(shape, index) for each in self.sets]
-        return type(self)(
-            sets, self.widths, self.program.select(index), self.described, self.plain
-        )
+        return type(self)(sets, self.widths, self.program.select(index), self.described, self.plain)
 
     def maximize(
         self, required: Tensor, trial: Tensor, counts: Tensor, start: Tensor, settled: Settled

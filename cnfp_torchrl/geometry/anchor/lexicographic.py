@@ -33,6 +33,7 @@ LEEWAY = 1e-3
 ATTEMPTS = (3, 3, 4)
 """Steps inwards between looks at which states need more of them."""
 
+
 @torch.no_grad()
 def lexicographic_anchor(
     sets: Sequence[ConstraintSet], candidate: Tensor | None = None, leeway: float = LEEWAY
@@ -136,7 +137,9 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
         close = gap <= (1 - share) * torch.maximum(upper, -lower)
         return (decided & close) | (gap <= 1e-9 * width[index])
 
-    return everything.maximize(torch.zeros_like(rows, dtype=middle.dtype), rows, rows, middle, settled)
+    return everything.maximize(
+        torch.zeros_like(rows, dtype=middle.dtype), rows, rows, middle, settled
+    )
 
 
 def _flat(rows: Tensor, shape: torch.Size) -> Tensor:

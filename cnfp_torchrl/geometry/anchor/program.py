@@ -99,7 +99,9 @@ class Program:
             matrices=joined(
                 [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p in cones], height, dim
             ),
-            vectors=joined([_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height),
+            vectors=joined(
+                [_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height
+            ),
             cone_sizes=joined([p.size[..., None] for p in cones]),
             cone_rates=cone_rates,
             cone_weights=torch.ones_like(cone_rates),
@@ -138,9 +140,7 @@ class Program:
         """Return some of the B problems."""
         return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
-    def with_rows(
-        self, normals: Tensor, offsets: Tensor, rates: Tensor, weights: Tensor
-    ) -> Self:
+    def with_rows(self, normals: Tensor, offsets: Tensor, rates: Tensor, weights: Tensor) -> Self:
         """Return the problems with rows ``(B, m, d)`` added."""
         return replace(
             self,

@@ -172,14 +172,10 @@ class Search:
             part = self.everything.select(left).near(near[left])
             found = self._roomiest(part, rows, left)
             fits[left] = found.slack >= 0
-            self.kept[left] = torch.where(
-                fits[left].unsqueeze(-1), found.action, self.kept[left]
-            )
+            self.kept[left] = torch.where(fits[left].unsqueeze(-1), found.action, self.kept[left])
         return fits
 
-    def _roomiest(
-        self, part: Intersection, rows: Tensor, index: Tensor | None = None
-    ) -> Best:
+    def _roomiest(self, part: Intersection, rows: Tensor, index: Tensor | None = None) -> Best:
         """Find points with most slack beyond what rows require, or that there are none.
 
         Args:
