@@ -1,4 +1,4 @@
-"""Sets of allowed actions and their intersections: containment, slack, gauges, centres."""
+"""Sets of allowed actions and their intersections: containment, slack, gauges, anchors."""
 
 from cnfp_torchrl.geometry.anchor import (
     DEPTH,

@@ -35,7 +35,7 @@ class HalfSpaces(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
 
@@ -64,11 +64,11 @@ class HalfSpaces(ConstraintSet):
         lengths = self._offsets_and_lengths()[1]
         return type(self)(self.normals, self.offsets + by * lengths, validate_args=False)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        room = self._offsets_and_lengths()[0] - _rows(self.normals, centre)
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        room = self._offsets_and_lengths()[0] - _rows(self.normals, anchor)
         return partial(_gauge, self.normals, room.reciprocal())
 
     def bounding_box(self) -> Box:
@@ -94,10 +94,10 @@ class HalfSpaces(ConstraintSet):
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
         return self.normals.abs().sum(-1) * largest.unsqueeze(-1) + self.offsets.abs()
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
         normals[..., 0] = 1
-        offsets = centre[..., :1] + radius.unsqueeze(-1)
+        offsets = center[..., :1] + radius.unsqueeze(-1)
         return type(self)(
             normals.expand_as(self.normals),
             offsets.expand(*offsets.shape[:-1], self.offsets.shape[-1]),

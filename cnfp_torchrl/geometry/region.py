@@ -1,4 +1,4 @@
-"""The region of allowed actions in a state: an intersection of sets, seen from one centre."""
+"""The region of allowed actions in a state: an intersection of sets, seen from one anchor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Region:
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        centre: a point strictly inside all sets that are not dropped, ``(*batch, d)``.
+        anchor: a point strictly inside all sets that are not dropped, ``(*batch, d)``.
         active: which sets hold in which state, boolean ``(*batch, K + 1)``; None means all.
         relaxation: by how much the rows of each set are widened, ``(*batch, m)`` a set, as
             `lexicographic_anchor` finds it: 0 where the set is active. None means that all sets
@@ -35,7 +35,7 @@ class Region:
     """
 
     sets: tuple[ConstraintSet, ...]
-    centre: Tensor
+    anchor: Tensor
     active: Tensor | None = None
     relaxation: tuple[Tensor, ...] | None = None
     validate_args: InitVar[bool] = True
@@ -46,10 +46,10 @@ class Region:
         if not self.sets or not isinstance(self.sets[0], Box):
             given = [type(each).__name__ for each in self.sets]
             raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-        dims = [each.dim for each in self.sets] + [int(self.centre.shape[-1])]
+        dims = [each.dim for each in self.sets] + [int(self.anchor.shape[-1])]
         if len(set(dims)) > 1:
             raise GeometryError(
-                f"sets and centre: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
+                f"sets and anchor: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
             )
         if self.relaxation is not None and len(self.relaxation) != len(self.sets):
             raise GeometryError(
@@ -71,7 +71,7 @@ class Region:
             active = active.to(target)
         return type(self)(
             tuple(each.with_fields(lambda value, _: value.to(target)) for each in self.sets),
-            self.centre.to(target),
+            self.anchor.to(target),
             active,
             None if self.relaxation is None else tuple(each.to(target) for each in self.relaxation),
             validate_args=False,
@@ -139,24 +139,24 @@ class Region:
         and no gradient is NaN.
 
         Raises:
-            GeometryError: when sets and centre have several dtypes, in the coarser ones of which
+            GeometryError: when sets and anchor have several dtypes, in the coarser ones of which
                 the erosion by the finer one's rounding error is none.
         """
         dtypes = [each.dtype for each in self.sets]
-        if any(dtype != self.centre.dtype for dtype in dtypes):
+        if any(dtype != self.anchor.dtype for dtype in dtypes):
             raise GeometryError(
-                f"sets and centre: expected one dtype, given {dtypes} and {self.centre.dtype}; "
+                f"sets and anchor: expected one dtype, given {dtypes} and {self.anchor.dtype}; "
                 "convert them with .to(dtype)"
             )
         magnitude = self.bounds.magnitude()
         sets = [each.eroded(magnitude) for each in self.widened()]
         # No two points of the bounds are further apart than half of it.
-        beyond = magnitude * (4 * self.centre.shape[-1] ** 0.5)
+        beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
         for stage in range(1, len(sets)):
             counts = self.counts(stage)
             if counts is not None:
-                sets[stage] = sets[stage].unless_dropped(counts, self.centre, beyond)
-        return type(self)(tuple(sets), self.centre, validate_args=False)
+                sets[stage] = sets[stage].unless_dropped(counts, self.anchor, beyond)
+        return type(self)(tuple(sets), self.anchor, validate_args=False)
 
     @classmethod
     def build(
@@ -165,7 +165,7 @@ class Region:
         candidate: Tensor | None = None,
         leeway: float | None = None,
     ) -> Self:
-        """Find centre, active flags and relaxations by the lexicographic rule.
+        """Find anchor, active flags and relaxations by the lexicographic rule.
 
         See `cnfp_torchrl.geometry.lexicographic_anchor`, whose arguments these are.
         """
@@ -175,7 +175,7 @@ class Region:
         return cls(tuple(sets), found.anchor, found.active, found.relaxation)
 
     def _gauges(self, direction: Tensor) -> list[Tensor]:
-        gauges = [each.gauge(direction, self.centre) for each in self.widened()]
+        gauges = [each.gauge(direction, self.anchor) for each in self.widened()]
         return [self._unless_dropped(stage, gauge, 0.0) for stage, gauge in enumerate(gauges)]
 
     def _unless_dropped(self, stage: int, value: Tensor, neutral: float | bool) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from cnfp_torchrl.bijectors import Bijector, paper_squash
 from cnfp_torchrl.geometry import ConstraintSet
 
-CENTRE_KEY = ("constraints", "centre")
+ANCHOR_KEY = ("constraints", "anchor")
 
 
 class MissingGeometryError(KeyError):
@@ -91,12 +91,12 @@ class ConstraintBijector(TensorDictModuleBase):
 
     @property
     def active_key(self) -> NestedKey:
-        """Where `ConstraintCentre` says whether the constraint holds in a state."""
+        """Where `ConstraintAnchor` says whether the constraint holds in a state."""
         return ("constraints", self.name, "active")
 
     @property
     def relaxation_key(self) -> NestedKey:
-        """Where `ConstraintCentre` says by how much the constraint had to be widened in a state."""
+        """Where `ConstraintAnchor` says by how much the constraint had to be widened in a state."""
         return ("constraints", self.name, "relaxation")
 
     @property
@@ -106,7 +106,7 @@ class ConstraintBijector(TensorDictModuleBase):
 
     @property
     def anchor_keys(self) -> list[NestedKey]:
-        """All of what `ConstraintCentre` publishes of the constraint."""
+        """All of what `ConstraintAnchor` publishes of the constraint."""
         rows = self.row_relaxation_key
         return [self.active_key, self.relaxation_key, *([] if rows is None else [rows])]
 

@@ -18,22 +18,22 @@ from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Box, Region
 from cnfp_torchrl.modules.constraint_bijector import (
-    CENTRE_KEY,
+    ANCHOR_KEY,
     ConstraintBijector,
     in_order,
     require,
 )
 from cnfp_torchrl.modules.flows import Flow, resolve_flow
 
-_CENTRE_REMEDY = "append cnfp_torchrl.envs.ConstraintCentre after the geometry transforms"
+_ANCHOR_REMEDY = "append cnfp_torchrl.envs.ConstraintAnchor after the geometry transforms"
 
 
 class ConstrainedFlowModule(SafeProbabilisticModule):
     """Draw actions from a Gaussian pushed through the bijectors of all constraints.
 
     Reads the Gaussian's parameters and, for each constraint, the geometry that the environment's
-    transforms publish; an exact flow also reads the centre and the active flags that
-    `cnfp_torchrl.envs.ConstraintCentre` computes. Ends an actor, as TorchRL's own probabilistic
+    transforms publish; an exact flow also reads the anchor and the active flags that
+    `cnfp_torchrl.envs.ConstraintAnchor` computes. Ends an actor, as TorchRL's own probabilistic
     modules do.
 
     Sets are eroded by the rounding error of the action spec's dtype, in which actions are executed:
@@ -47,7 +47,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         order: the constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
         flow: how the sets are combined: a `Flow`, or ``exact``, ``gauge``, ``radial``, ``squash``,
-            ``projection``, ``none``.
+            ``projection``, ``unconstrained``.
         in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
         out_key: the action, ``(*batch, d)``.
         return_log_prob: also write the action's log-density, ``(*batch,)``.
@@ -122,7 +122,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     @property
     def stage_names(self) -> list[str]:
         """Names of the stages of `get_dist(...).stages`, in order of application."""
-        if self.flow.is_exact:
+        if self.flow.is_safe:
             return ["bounds", *self.order]
         return self.order if self.flow.reads_constraints and self.order else ["bounds"]
 
@@ -131,33 +131,33 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if not self.flow.reads_constraints:
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
-        if self.flow.is_exact:
+        if self.flow.is_safe:
             keys += [key for bijector in self.bijectors for key in bijector.anchor_keys]
-            keys += [CENTRE_KEY]
+            keys += [ANCHOR_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            MissingGeometryError: when geometry, centre, active flags or relaxations are missing.
+            MissingGeometryError: when geometry, anchor, active flags or relaxations are missing.
         """
         bounds = self.bounds
         if not self.flow.reads_constraints:
             return self.flow(bounds, [])
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
-        if not self.flow.is_exact:
+        if not self.flow.is_safe:
             return self.flow(bounds, sets)
-        centre = self._centre(tensordict).to(self.action_dtype)
+        anchor = self._anchor(tensordict).to(self.action_dtype)
         relaxation = self._relaxation(tensordict)
-        return self.flow(bounds, sets, centre, self._active(tensordict), relaxation)
+        return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
-        """Return the region of allowed actions, for any flow; needs centre, flags, relaxations."""
+        """Return the region of allowed actions, for any flow; needs anchor, flags, relaxations."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
         return Region(
             (self.bounds, *sets),
-            self._centre(tensordict),
+            self._anchor(tensordict),
             self._active(tensordict),
             self._relaxation(tensordict),
         )
@@ -188,14 +188,14 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         with set_interaction_type(InteractionType.RANDOM):
             return self(tensordict)
 
-    def _centre(self, tensordict: TensorDictBase) -> Tensor:
-        return require(tensordict, CENTRE_KEY, _CENTRE_REMEDY)
+    def _anchor(self, tensordict: TensorDictBase) -> Tensor:
+        return require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
 
     def _active(self, tensordict: TensorDictBase) -> Tensor | None:
         if not self.bijectors:
             return None
         flags = [
-            require(tensordict, bijector.active_key, _CENTRE_REMEDY) for bijector in self.bijectors
+            require(tensordict, bijector.active_key, _ANCHOR_REMEDY) for bijector in self.bijectors
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
 
@@ -204,7 +204,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         amounts = [self.low.new_zeros(())]
         for bijector in self.bijectors:
             rows = bijector.row_relaxation_key
-            amount = require(tensordict, rows or bijector.relaxation_key, _CENTRE_REMEDY)
+            amount = require(tensordict, rows or bijector.relaxation_key, _ANCHOR_REMEDY)
             amounts.append(amount if rows is not None else amount.unsqueeze(-1))
         return tuple(amounts)
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FixedLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
-from cnfp_torchrl.visual.colours import INK, MUTED
+from cnfp_torchrl.visual.colors import INK, MUTED
 
 Floats = NDArray[np.float64]
 
@@ -28,12 +28,12 @@ class Look:
 
     Args:
         label: its name for readers.
-        colour: as ``#RRGGBB``.
-        marker: of matplotlib; tells methods apart where colours do not.
+        color: as ``#RRGGBB``.
+        marker: of matplotlib; tells methods apart where colors do not.
     """
 
     label: str
-    colour: str
+    color: str
     marker: str
 
 
@@ -71,10 +71,10 @@ def draw_band(
     """
     every = max(of, len(x) // _MARKS)
     layer = of - place
-    axes.fill_between(x, low, high, color=look.colour, alpha=0.18, linewidth=0, zorder=2 + layer)
-    axes.plot(x, value, color=look.colour, linewidth=1.5, zorder=2 + layer)
+    axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0, zorder=2 + layer)
+    axes.plot(x, value, color=look.color, linewidth=1.5, zorder=2 + layer)
     axes.plot(
-        x, value, look.marker, color=look.colour, markersize=5,
+        x, value, look.marker, color=look.color, markersize=5,
         markevery=(every * place // of, every), markeredgecolor="white", markeredgewidth=0.6,
         zorder=2 + of + layer,
     )  # fmt: skip
@@ -99,7 +99,7 @@ def draw_estimates(
     """
     for row, (look, estimate, values) in enumerate(zip(looks, estimates, runs, strict=True)):
         axes.plot(
-            values, np.full(len(values), row + 0.22), "o", color=look.colour, markersize=3,
+            values, np.full(len(values), row + 0.22), "o", color=look.color, markersize=3,
             alpha=0.45, markeredgewidth=0, zorder=2,
         )  # fmt: skip
         if estimate is None:
@@ -110,9 +110,9 @@ def draw_estimates(
             continue
         if estimate.low is not None and estimate.high is not None:
             ends = (estimate.low, estimate.high)
-            axes.plot(ends, (row, row), color=look.colour, linewidth=2.2, zorder=3)
+            axes.plot(ends, (row, row), color=look.color, linewidth=2.2, zorder=3)
         axes.plot(
-            estimate.value, row, look.marker, color=look.colour, markersize=7,
+            estimate.value, row, look.marker, color=look.color, markersize=7,
             markeredgecolor="white", markeredgewidth=0.8, zorder=4,
         )  # fmt: skip
     axes.set_ylim(len(looks) - 0.4, -0.6)
@@ -163,7 +163,7 @@ def step_axis(axes: Axes) -> None:
 def legend_below(figure: Figure, looks: Sequence[Look], *, columns: int = 4) -> None:
     """Name the methods below all panels."""
     entries = [
-        Line2D([], [], color=look.colour, marker=look.marker, markersize=6, linewidth=1.5,
+        Line2D([], [], color=look.color, marker=look.marker, markersize=6, linewidth=1.5,
                markeredgecolor="white", markeredgewidth=0.6, label=look.label)
         for look in looks
     ]  # fmt: skip
@@ -199,7 +199,7 @@ def spread_labels(
         taken.append((near, far, level))
         axes.annotate(
             look.label, tuple(places[i]), (x + 0.03 * side, level), xycoords="axes fraction",
-            ha="left" if side > 0 else "right", va="center", color=look.colour,
+            ha="left" if side > 0 else "right", va="center", color=look.color,
             fontsize=_NAME_SIZE,
             arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.5, "shrinkB": 5,
                         "relpos": (0.0 if side > 0 else 1.0, 0.5)},

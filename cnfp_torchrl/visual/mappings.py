@@ -19,17 +19,17 @@ from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.visual.canvas import house_style, new_figure
-from cnfp_torchrl.visual.colours import FAINT, INK, MUTED
+from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
 from cnfp_torchrl.visual.outlines import Line, View
 
 PARTICLES = "cividis"
-"""Colours of particles by their distance from the origin: even with any colour vision."""
+"""Colors of particles by their distance from the origin: even with any color vision."""
 
 _COUNT = 320
 _FARTHEST = 3.0
 _WEB_REACH, _WEB_LINES, _WEB_NODES = 2.4, 13, 601
 _TEAR = 0.06
-"""Neighbours on a line of the web that land farther apart than this lie on two sides of a tear."""
+"""Neighbors on a line of the web that land farther apart than this lie on two sides of a tear."""
 _COLUMNS = 5
 
 
@@ -57,18 +57,18 @@ class MappingExample:
 def mappings(
     examples: Sequence[MappingExample],
     *,
-    colour: str,
+    color: str,
     view: View = (-1.15, 1.15, -1.15, 1.15),
     title: str = "",
 ) -> Figure:
     """Draw the same particles and the same square web before and after each bijection.
 
-    A particle keeps its colour, which tells how far from the origin it started; where a bijection
+    A particle keeps its color, which tells how far from the origin it started; where a bijection
     tears the plane, lines of the web end.
 
     Args:
         examples: one for each panel, after the first panel, which shows the Gaussian.
-        colour: of the sets.
+        color: of the sets.
         view: limits of all panels but the first.
         title: above the panels; none by default.
     """
@@ -88,9 +88,9 @@ def mappings(
         _frame(panels[0], (-3.4, 3.4, -3.4, 3.4))
         for panel, example in zip(panels[1:], examples, strict=True):
             area = Path.make_compound_path(*(Path(line, closed=True) for line in example.outlines))
-            panel.add_patch(PathPatch(area, facecolor=colour, linewidth=0, alpha=0.16, zorder=0))
+            panel.add_patch(PathPatch(area, facecolor=color, linewidth=0, alpha=0.16, zorder=0))
             for line in example.outlines:
-                panel.plot(*line.T, color=colour, linewidth=1.8, zorder=4)
+                panel.plot(*line.T, color=color, linewidth=1.8, zorder=4)
             for line in example.context:
                 panel.plot(*line.T, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)), zorder=3)
             _draw_web(panel, example.bijector.forward_and_log_det(_web())[0])
@@ -141,9 +141,9 @@ def _split(line: Tensor, tears: Tensor) -> list[Line]:
 
 def _draw_particles(axes: Axes, latents: Tensor, places: Tensor, scale: Normalize) -> None:
     x, y = places.numpy().T
-    colours = vector_norm(latents, dim=-1).numpy()
+    colors = vector_norm(latents, dim=-1).numpy()
     axes.scatter(
-        x, y, c=colours, cmap=PARTICLES, norm=scale, s=9, linewidths=0.3, edgecolors="white",
+        x, y, c=colors, cmap=PARTICLES, norm=scale, s=9, linewidths=0.3, edgecolors="white",
         zorder=5,
     )  # fmt: skip
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from experiments.paper.comparisons import as_fast, at_least, faster, higher, on_par
-from experiments.paper.judgements import (
+from experiments.paper.judgments import (
     PENALISED,
     Evidence,
     afterwards,

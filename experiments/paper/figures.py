@@ -64,7 +64,7 @@ FIGURES = {
         "Particles before and after each mapping",
         "The paper's second figure: its squashes in the first row, then a retraction and the exact "
         "flow into further sets, within the dashed action bounds; a shell has a squash of its own. "
-        "A particle keeps its colour.",
+        "A particle keeps its color.",
     ),
 }
 """Title and caption by the name of the file."""

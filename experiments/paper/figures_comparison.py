@@ -46,15 +46,15 @@ def draw_trade_off(records: Sequence[Record]) -> Figure:
             look = label(method).look
             counts = [float(total_violations(run)) for run in runs[method]]
             scores = [run.evaluation[STOCHASTIC].score for run in runs[method]]
-            axes.plot(counts, scores, ".", color=look.colour, alpha=0.5, markersize=6, mew=0)
+            axes.plot(counts, scores, ".", color=look.color, alpha=0.5, markersize=6, mew=0)
             count, score = interquartile_mean(counts), interquartile_mean(scores)
             for ends in (
                 ((count.low, score.value), (count.high, score.value)),
                 ((count.value, score.low), (count.value, score.high)),
             ):
-                axes.plot(*np.array(ends, dtype=float).T, color=look.colour, linewidth=1.4)
+                axes.plot(*np.array(ends, dtype=float).T, color=look.color, linewidth=1.4)
             axes.plot(
-                count.value, score.value, look.marker, color=look.colour, markersize=10,
+                count.value, score.value, look.marker, color=look.color, markersize=10,
                 markeredgecolor="white", zorder=5,
             )  # fmt: skip
             points.append((count.value, score.value, look))

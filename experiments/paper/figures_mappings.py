@@ -9,12 +9,12 @@ from torch import Tensor
 from cnfp_torchrl.bijectors import (
     BallSquash,
     Bijector,
-    BijectorChain,
     BoxSquash,
     EllipsoidSquash,
     GaugeSquash,
     Retraction,
     ShellSquash,
+    SquashChain,
 )
 from cnfp_torchrl.geometry import (
     Ball,
@@ -30,7 +30,7 @@ from cnfp_torchrl.geometry import (
 from cnfp_torchrl.visual.mappings import MappingExample, mappings
 from cnfp_torchrl.visual.outlines import Line, region_outline, set_outline
 
-COLOUR = "#E69F00"
+COLOR = "#E69F00"
 _VIEW = (-1.15, 1.15, -1.15, 1.15)
 
 
@@ -66,7 +66,7 @@ def mapping_examples() -> list[MappingExample]:
 
 def draw_mappings() -> Figure:
     """Draw `mapping_examples`."""
-    return mappings(mapping_examples(), colour=COLOUR, view=_VIEW)
+    return mappings(mapping_examples(), color=COLOR, view=_VIEW)
 
 
 def _onto(title: str, bijector: Bijector, image: ConstraintSet) -> MappingExample:
@@ -75,7 +75,7 @@ def _onto(title: str, bijector: Bijector, image: ConstraintSet) -> MappingExampl
 
 def _retraction(ball: Ball) -> MappingExample:
     squash = BoxSquash(BOUNDS.low, BOUNDS.high)
-    chain = BijectorChain([squash, Retraction(BOUNDS, ball, ball.center)])
+    chain = SquashChain([squash, Retraction(BOUNDS, ball, ball.center)])
     return MappingExample(
         "retraction of the bounds", chain, set_outline(ball, _VIEW), _bounds(), first=squash
     )

@@ -24,7 +24,7 @@ class Label:
     """A method as readers meet it.
 
     Args:
-        look: name, colour and marker.
+        look: name, color and marker.
         kind: what it does about the constraints.
     """
 
@@ -32,8 +32,8 @@ class Label:
     kind: Kind
 
 
-# Colours of Okabe and Ito and greys of purple for the exact flow's two entropies; markers differ
-# too, so that no method is told by its colour alone.
+# Colors of Okabe and Ito and grays of purple for the exact flow's two entropies; markers differ
+# too, so that no method is told by its color alone.
 LABELS = {
     "exact": Label(Look("exact flow (ours)", "#4B2E83", "D"), Kind.EXACT),
     "exact_action_entropy": Label(
@@ -49,7 +49,7 @@ LABELS = {
     ),
     "penalty": Label(Look("reward penalty", "#8C510A", "v"), Kind.LEARNED),
     "unconstrained": Label(Look("unconstrained SAC", "#6E6E6E", "X"), Kind.IGNORED),
-    "none": Label(Look("action bounds alone", "#3A3A3A", "x"), Kind.IGNORED),
+    "unconstrained": Label(Look("action bounds alone", "#3A3A3A", "x"), Kind.IGNORED),
 }
 """In the order in which they are shown."""
 
@@ -61,12 +61,12 @@ def label(method: str) -> Label:
     if method in LABELS:
         return LABELS[method]
     family = max((name for name in LABELS if method.startswith(f"{name}_")), key=len, default=None)
-    colour, marker = _SPARE[sum(method.encode()) % len(_SPARE)]
+    color, marker = _SPARE[sum(method.encode()) % len(_SPARE)]
     if family is None:
-        return Label(Look(method, colour, marker), Kind.LEARNED)
+        return Label(Look(method, color, marker), Kind.LEARNED)
     rest = method.removeprefix(f"{family}_").replace("_", " ")
     known = LABELS[family]
-    return Label(Look(f"{known.look.label}, {rest}", colour, marker), known.kind)
+    return Label(Look(f"{known.look.label}, {rest}", color, marker), known.kind)
 
 
 def in_order(methods: Iterable[str]) -> list[str]:

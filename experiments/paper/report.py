@@ -18,7 +18,7 @@ from experiments.paper.figures_flow import UNTRAINED, KeptPolicy, find_policy
 from experiments.paper.hostile import KEPT as KEPT_HOSTILE
 from experiments.paper.hostile import HostileRun, load_hostile
 from experiments.paper.intersections import FLOWS
-from experiments.paper.judgements import Evidence
+from experiments.paper.judgments import Evidence
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import Record, load_records
 from experiments.paper.report_tables import (

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors import AlignedSquash
+from cnfp_torchrl.bijectors import ExactSquash
 from cnfp_torchrl.geometry import (
     DEPTH,
     LEEWAY,
@@ -71,7 +71,7 @@ class Scenario:
 
 
 SCENARIOS = [
-    Scenario("none", (), ()),
+    Scenario("unconstrained", (), ()),
     Scenario("all hold", (LEFT, box((-0.9, 0.0), (0.5, 0.5))), (True, True)),
     Scenario("the higher of two", (LEFT, RIGHT), (False, True)),
     Scenario("the higher of two, turned round", (RIGHT, LEFT), (False, True)),
@@ -126,7 +126,7 @@ def test_scenario(scenario: Scenario, dtype: torch.dtype) -> None:
 def test_one_batch_of_different_states() -> None:
     """Intervals and balls in every relation to each other, in one batch with two dimensions."""
     rows = [
-        # ball's centre, box's low and high in the first component: who holds of (box, ball)
+        # ball's center, box's low and high in the first component: who holds of (box, ball)
         (0.0, -0.5, 0.5, (True, True)),
         (0.9, -0.9, -0.5, (False, True)),
         (3.0, -0.5, 0.5, (False, False)),
@@ -292,8 +292,8 @@ class Slab(ConstraintSet):
         distance = (self.normal * action).sum(-1).abs()
         return (self.width - distance) / torch.linalg.vector_norm(self.normal, dim=-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        along, at = (self.normal * direction).sum(-1), (self.normal * centre).sum(-1)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        along, at = (self.normal * direction).sum(-1), (self.normal * anchor).sum(-1)
         return torch.maximum(along / (self.width - at), -along / (self.width + at))
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Slab:
@@ -301,9 +301,9 @@ class Slab(ConstraintSet):
         eps = 16 * torch.finfo(self.dtype).eps
         return Slab(self.normal, self.width - eps * size, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Slab:
+    def around(self, center: Tensor, radius: Tensor) -> Slab:
         reach = torch.linalg.vector_norm(self.normal, dim=-1) * radius
-        return Slab(self.normal, (self.normal * centre).sum(-1).abs() + reach, validate_args=False)
+        return Slab(self.normal, (self.normal * center).sum(-1).abs() + reach, validate_args=False)
 
 
 def test_a_new_family_needs_five_statements() -> None:
@@ -372,7 +372,7 @@ def test_sets_far_beyond_the_bounds_are_dropped(distance: float, dtype: torch.dt
         assert found.anchor.isfinite().all()
         assert BOUNDS.contains(found.anchor).all()
         assert found.active[..., 1].tolist() == [False] * 8 + [True]
-        action = AlignedSquash(Region(tuple(sets), *found))(torch.randn(50, 9, 2).to(dtype))
+        action = ExactSquash(Region(tuple(sets), *found))(torch.randn(50, 9, 2).to(dtype))
         assert BOUNDS.contains(action).all()
 
 
@@ -425,14 +425,14 @@ def test_region_build() -> None:
     region = Region.build([BOUNDS, LEFT, RIGHT])
     assert region.active is not None
     assert region.active.tolist() == [True, False, True]
-    assert region.slack(region.centre) > 1e-3
+    assert region.slack(region.anchor) > 1e-3
     # The box that gives way gives way to where the other one begins, and there is room.
     left = region.widened()[1]
     assert isinstance(left, Box)
     assert 0.2 < left.high[0] < 0.21
     assert left.high[1] == 1
     # Without relaxations what does not hold is dropped, and adds nothing.
-    dropped = Region(region.sets, region.centre, region.active)
+    dropped = Region(region.sets, region.anchor, region.active)
     gauges = dropped.eroded().gauges(torch.randn(50, 2).double())
     assert (gauges[1] == gauges[0]).all()
     assert (gauges[2] >= gauges[1]).all()

@@ -17,10 +17,10 @@ def test_an_invertible_map_makes_an_ellipsoid() -> None:
     offset = -(inverse @ center.unsqueeze(-1)).squeeze(-1)
     ball = TaskSpaceBall(inverse, offset, torch.ones(5).double())
     ellipsoid = Ellipsoid(center, tril)
-    centre = center + 0.1 * (tril @ torch.randn(5, 3, 1).double()).squeeze(-1)
+    anchor = center + 0.1 * (tril @ torch.randn(5, 3, 1).double()).squeeze(-1)
     way = torch.randn(100, 5, 3).double()
-    torch.testing.assert_close(ball.gauge(way, centre), ellipsoid.gauge(way, centre))
-    torch.testing.assert_close(ball.slack(centre + way), ellipsoid.slack(centre + way))
+    torch.testing.assert_close(ball.gauge(way, anchor), ellipsoid.gauge(way, anchor))
+    torch.testing.assert_close(ball.slack(anchor + way), ellipsoid.slack(anchor + way))
 
 
 def test_some_rows_of_the_identity_make_a_ball_in_these_components() -> None:
@@ -70,6 +70,6 @@ def test_the_unit_of_the_image_does_not_matter(unit: float) -> None:
     here = TaskSpaceBall(jacobian, offset, torch.tensor(0.2))
     there = TaskSpaceBall(unit * jacobian, unit * offset, torch.tensor(0.2 * unit))
     way = torch.randn(100, 2)
-    for centre in (torch.zeros(2), torch.tensor([0.05, -0.1])):
-        torch.testing.assert_close(there.gauge(way, centre), here.gauge(way, centre))
-        torch.testing.assert_close(there.slack(centre + way), here.slack(centre + way))
+    for anchor in (torch.zeros(2), torch.tensor([0.05, -0.1])):
+        torch.testing.assert_close(there.gauge(way, anchor), here.gauge(way, anchor))
+        torch.testing.assert_close(there.slack(anchor + way), here.slack(anchor + way))

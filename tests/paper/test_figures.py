@@ -96,9 +96,7 @@ def test_violations_per_episode_add_up() -> None:
 
 def test_every_method_of_the_library_has_a_look_of_its_own() -> None:
     looks = [each.look for each in LABELS.values()]
-    assert (
-        len({look.colour for look in looks}) == len({look.marker for look in looks}) == len(looks)
-    )
+    assert len({look.color for look in looks}) == len({look.marker for look in looks}) == len(looks)
     known = {path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml")}
     assert known & set(LABELS) >= {"exact", "squash", "penalty", "lagrangian", "unconstrained"}
     assert in_order(["unconstrained", "penalty_small", "mine", "exact", "penalty"]) == [
@@ -163,7 +161,7 @@ def test_kept_policy_comes_from_a_run(tiny_run: TinyRun, tmp_path: Path) -> None
     assert find_policy(tmp_path / "none.json", tmp_path / "nowhere") is UNTRAINED
 
     other, _ = tiny_run("experiment=squash")
-    with pytest.raises(ValueError, match="expected one of the exact flow, given PaperChain"):
+    with pytest.raises(ValueError, match="expected one of the exact flow, given SquashFlow"):
         policy_of(other)
 
 

@@ -30,7 +30,7 @@ def test_particles_land_in_the_set(draws: Callable[[Figure], bool]) -> None:
         MappingExample("box", box, (), first=box),
         MappingExample("shell", ShellSquash(ZERO, RADIUS / 4, RADIUS), set_outline(ball, VIEW)),
     ]
-    figure = mappings(examples, colour="#E69F00", title="three")
+    figure = mappings(examples, color="#E69F00", title="three")
     titles = [axes.get_title() for axes in figure.axes[:4]]
     assert titles == ["before: z ~ N(0, I)", "ball", "box", "shell"]
     before, *after = (axes.collections[-1].get_offsets() for axes in figure.axes[:4])

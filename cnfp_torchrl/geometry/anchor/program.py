@@ -45,7 +45,7 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """B problems "maximise t such that all sets have slack t", as stacks of rows, cones and sums.
+    """B problems "maximize t such that all sets have slack t", as stacks of rows, cones and sums.
 
     Fields carry B first; each inequality has a weight of 1, or of 0 where it is to be ignored, and
     a rate of 0 where it must hold whatever t is.
@@ -114,7 +114,7 @@ class Program:
         )
 
     def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
-        """Return the problems "maximise t such that all slacks exceed what is required by t".
+        """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
             required: slacks ``(B, M)`` of all inequalities, in their order.
