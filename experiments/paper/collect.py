@@ -8,12 +8,13 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+import yaml
 
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.visual import read_scalars
@@ -36,7 +37,8 @@ def collect(folder: RunFolder) -> Record:
         ValueError: when the run was started without an experiment.
         FileNotFoundError: when the run is not finished.
     """
-    overrides = [str(each) for each in OmegaConf.load(folder.path / ".hydra" / "overrides.yaml")]
+    text = (folder.path / ".hydra" / "overrides.yaml").read_text(encoding="utf-8")
+    overrides = [str(each) for each in yaml.safe_load(text)]
     chosen = dict(each.split("=", 1) for each in overrides if "=" in each)
     if "experiment" not in chosen:
         raise ValueError(f"{folder.path}: expected a run with experiment=METHOD, given {overrides}")
@@ -47,7 +49,7 @@ def collect(folder: RunFolder) -> Record:
         method=chosen["experiment"],
         seed=summary["seed"],
         overrides=tuple(each for each in overrides if each.split("=", 1)[0] not in own),
-        config=settings(folder.load_config()),
+        config=settings(folder.load_settings()),
         versions=versions(),
         commit=commit(),
         steps=summary["steps"],
@@ -64,12 +66,14 @@ def collect(folder: RunFolder) -> Record:
     )
 
 
-def settings(config: DictConfig) -> dict[str, Any]:
-    """Return what decides a run's result, resolved, as JSON would give it back."""
-    content = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(content, dict)
+def settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what decides a run's result, as JSON would give it back.
+
+    Args:
+        config: plain data, with every interpolation resolved.
+    """
     return json.loads(
-        json.dumps({name: each for name, each in content.items() if name not in PRESENTATION})
+        json.dumps({name: each for name, each in config.items() if name not in PRESENTATION})
     )
 
 

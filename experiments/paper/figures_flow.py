@@ -164,7 +164,7 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
         gaussians[name] = (tuple(loc.tolist()), tuple(scale.tolist()))
     source = (
         f"the network of the exact flow, seed {config.seed}, after "
-        f"{config.collector.total_frames:,} training steps"
+        f"{folder.load_settings()['collector']['total_frames']:,} training steps"
     )
     return KeptPolicy(source, gaussians)
 

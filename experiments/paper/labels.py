@@ -48,8 +48,7 @@ LABELS = {
         Look("SAC-Lagrangian, small threshold", "#B2182B", "<"), Kind.LEARNED
     ),
     "penalty": Label(Look("reward penalty", "#8C510A", "v"), Kind.LEARNED),
-    "unconstrained": Label(Look("unconstrained SAC", "#6E6E6E", "X"), Kind.IGNORED),
-    "unconstrained": Label(Look("action bounds alone", "#3A3A3A", "x"), Kind.IGNORED),
+    "unconstrained": Label(Look("unconstrained", "#6E6E6E", "X"), Kind.IGNORED),
 }
 """In the order in which they are shown."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
@@ -60,7 +61,9 @@ class Job:
     def settings(self) -> dict[str, Any]:
         """Return the configuration that the run's record must have."""
         with initialize_config_dir(str(config_directory()), version_base="1.3"):
-            return settings(compose("train", self.arguments))
+            content = OmegaConf.to_container(compose("train", self.arguments), resolve=True)
+        assert isinstance(content, dict)
+        return settings({str(name): each for name, each in content.items()})
 
 
 def known_methods() -> list[str]:
@@ -137,7 +140,9 @@ def still_to_do(jobs: Sequence[Job], data: Path) -> list[Job]:
 def finished_folder(job: Job, runs: Path) -> Path | None:
     """Return the folder of a finished run of the job, of which there is no record yet."""
     for path in sorted((runs / job.method).glob(f"seed_{job.seed}*")):
-        if (path / SUMMARY).is_file() and settings(RunFolder(path).load_config()) == job.settings():
+        if (path / SUMMARY).is_file() and settings(
+            RunFolder(path).load_settings()
+        ) == job.settings():
             return path
     return None
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cnfp_torchrl.whole_file import whole_file
 from experiments.paper.fields import Fields, RecordError
 
 FORMAT, VERSION = "cnfp_torchrl paper record", 1
@@ -132,13 +132,10 @@ class Record:
             )
         path.parent.mkdir(parents=True, exist_ok=True)
         document = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(self)}
-        partial = path.with_suffix(f".{os.getpid()}.partial")
-        try:
-            partial.write_text(json.dumps(document) + "\n")
-            load_record(partial)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(path) as file:
+            file.write(f"{json.dumps(document)}\n".encode())
+            file.flush()
+            load_record(Path(file.name))
         return path
 
     def _extends(self, path: Path) -> bool:

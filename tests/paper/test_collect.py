@@ -44,7 +44,7 @@ def test_a_record_says_what_the_run_left(run: RunFolder, tmp_path: Path) -> None
     for name, (steps, values) in logged.items():
         assert record.curves[name].steps == tuple(steps)
         assert record.curves[name].values == pytest.approx(tuple(values), rel=1e-5)
-    assert record.config == settings(run.load_config())
+    assert record.config == settings(run.load_settings())
     assert record.config["env"]["base"]["max_steps"] == 4
     assert {"python", "torch", "torchrl", "cnfp_torchrl"} <= set(record.versions)
     assert len(record.path(tmp_path / "data").read_bytes()) < 30_000

@@ -166,6 +166,6 @@ def test_what_is_wrong_is_named_and_left_out(tmp_path: Path) -> None:
 
 
 def test_no_record_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--data", str(tmp_path / "unconstrained"), "--output", str(tmp_path)]) == 1
+    assert main(["--data", str(tmp_path / "none"), "--output", str(tmp_path)]) == 1
     assert "expected a record or more" in capsys.readouterr().err
     assert not (tmp_path / "README.md").exists()
