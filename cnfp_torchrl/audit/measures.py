@@ -22,7 +22,6 @@ from cnfp_torchrl.audit.report import (
 )
 from cnfp_torchrl.audit.rollouts import Record
 from cnfp_torchrl.audit.trial import Trial, describe
-from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 

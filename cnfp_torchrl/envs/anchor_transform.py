@@ -112,8 +112,8 @@ class ConstraintAnchor(Transform):
 
     Writes ``("constraints", "anchor")``, ``(*batch, d)``, and of each constraint
 
-    - ``("constraints", NAME, "active")``, boolean ``(*batch,)``: False where it cannot hold together
-      with those of higher priority,
+    - ``("constraints", NAME, "active")``, boolean ``(*batch,)``: False where it cannot hold
+      together with those of higher priority,
     - ``("constraints", NAME, "relaxation")``, ``(*batch,)``: by how much it is widened there, in
       units of its slack; 0 where it is active, infinite where it had to be dropped,
     - ``("constraints", NAME, "row_relaxation")``, ``(*batch, m)``: the same row by row, if its

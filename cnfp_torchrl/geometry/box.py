@@ -43,7 +43,7 @@ class Box(ConstraintSet):
         return torch.minimum(self.high - action, action - self.low).amin(-1)
 
     def row_slacks(self, action: Tensor) -> Tensor:
-        """Return the distances to the high bounds, then those to the low bounds, ``(*batch, 2d)``."""
+        """Return the distances to the high bounds, then to the low bounds, ``(*batch, 2d)``."""
         return torch.cat(torch.broadcast_tensors(self.high - action, action - self.low), -1)
 
     def inflated(self, by: Tensor) -> Self:

@@ -131,9 +131,9 @@ class ConstraintSet(ABC):
         return cls.row_slacks is not ConstraintSet.row_slacks
 
     def row_slacks(self, action: Tensor) -> Tensor:
-        """Return the slacks of the rows that a set is made of, ``(*batch, m)``; `slack` is the least.
+        """Return the slacks of the rows that a set is made of, ``(*batch, m)``.
 
-        By default the set is one row.
+        Their least is `slack`; by default the set is one row.
         """
         return self.slack(action).unsqueeze(-1)
 

@@ -105,10 +105,9 @@ class ConstraintBijector(TensorDictModuleBase):
         return ("constraints", self.name, "row_relaxation") if self.set_type.has_rows() else None
 
     @property
-    def anchor_keys(self) -> list[NestedKey]:
-        """All of what `ConstraintAnchor` publishes of the constraint."""
-        rows = self.row_relaxation_key
-        return [self.active_key, self.relaxation_key, *([] if rows is None else [rows])]
+    def amounts_key(self) -> NestedKey:
+        """Where the amounts are by which a flow widens the set: row by row if there are rows."""
+        return self.row_relaxation_key or self.relaxation_key
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the sets of allowed actions; their values were checked when published.

@@ -132,8 +132,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
         if self.flow.is_safe:
-            keys += [key for bijector in self.bijectors for key in bijector.anchor_keys]
-            keys += [ANCHOR_KEY]
+            keys += [bijector.active_key for bijector in self.bijectors]
+            keys += [bijector.amounts_key for bijector in self.bijectors] + [ANCHOR_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
@@ -149,7 +149,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if not self.flow.is_safe:
             return self.flow(bounds, sets)
         anchor = self._anchor(tensordict).to(self.action_dtype)
-        relaxation = self._relaxation(tensordict)
+        relaxation = tuple(each.to(self.action_dtype) for each in self._relaxation(tensordict))
         return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
@@ -203,9 +203,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         """Return by how much the rows of each set are widened, the bounds' by nothing."""
         amounts = [self.low.new_zeros(())]
         for bijector in self.bijectors:
-            rows = bijector.row_relaxation_key
-            amount = require(tensordict, rows or bijector.relaxation_key, _ANCHOR_REMEDY)
-            amounts.append(amount if rows is not None else amount.unsqueeze(-1))
+            amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
+            amounts.append(amount if bijector.row_relaxation_key else amount.unsqueeze(-1))
         return tuple(amounts)
 
 

@@ -50,7 +50,8 @@ class Flow(ABC):
         Args:
             bounds: the action bounds.
             sets: the constraints' sets in order of application.
-            anchor: a point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact flows.
+            anchor: a point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact
+                flows.
             active: which of bounds and sets hold, ``(*batch, K + 1)``; for exact flows.
             relaxation: by how much the rows of bounds and sets are widened, ``(*batch, m)`` each;
                 for exact flows. None means that sets which do not hold are dropped.

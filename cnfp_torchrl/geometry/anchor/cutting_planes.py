@@ -36,8 +36,8 @@ def maximize_slack_by_cuts(
         problem: B problems in float64, without the sets.
         sets: the further sets, each of batch shape ``(B,)``, in float64.
         required: their slacks, which those on trial exceed by t, ``(B, len(sets))``.
-        trial: which of them are on trial, 1 or 0.
-        counts: which of them count, 1 or 0.
+        trial: which of them are on trial, boolean.
+        counts: which of them count, boolean.
         start: points strictly inside of all that must hold, ``(B, d)``.
         scale: the mean widths of the action bounds, ``(B,)``.
         settled: tells which problems need no more work.
@@ -47,7 +47,7 @@ def maximize_slack_by_cuts(
     )
     left = torch.arange(len(start), device=start.device)
     for _ in range(MAX_CUTS):
-        at, needs, tried, on = start[left], required[left], trial[left] > 0, counts[left] > 0
+        at, needs, tried, on = start[left], required[left], trial[left], counts[left]
 
         def half_settled(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
             """Tell where a point is well inside the rows so far."""

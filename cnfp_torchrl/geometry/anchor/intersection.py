@@ -1,4 +1,4 @@
-"""Intersections of sets as the search sees them: their slacks row by row, and points of most room."""
+"""Intersections of sets as the search sees them: slacks row by row, and points of most room."""
 
 from __future__ import annotations
 
@@ -113,14 +113,22 @@ class Intersection:
         """
         bounds = self.bounds
         scale = (bounds.high - bounds.low).mean(-1)
-        rows = (required, trial.to(required), counts.to(required))
-        problem = self.program.requiring(*(each[:, self.described] for each in rows))
+        tried, counted = trial.to(required), counts.to(required)
+        at = self.described
+        problem = self.program.requiring(required[:, at], tried[:, at], counted[:, at])
         if not self.plain:
             return maximize_slack(problem, start, scale, settled)
         sets = [self.sets[i] for i in self.plain]
-        at = [self.rows_of(i).start for i in self.plain]
+        rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(
-            problem, sets, *(each[:, at] for each in rows), start, scale, settled
+            problem,
+            sets,
+            required[:, rows],
+            trial[:, rows],
+            counts[:, rows],
+            start,
+            scale,
+            settled,
         )
 
 
@@ -140,4 +148,5 @@ def _described(
         first += width
     described = torch.tensor(owners[Rows] + owners[Cone] + owners[KinkedSum])
     plain = tuple(i for i, part in enumerate(parts) if part is None)
-    return Program.stack(known, batch), described.to(known[0].rates.device), plain
+    device = next(iter(sets[0].fields().values())).device
+    return Program.stack(known, batch), described.to(device), plain

@@ -113,8 +113,9 @@ def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> T
 def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
     """Find points whose smallest slack in all sets is a large share of the best one.
 
-    A batched interior-point method in float64. A set that does not describe its `superlevel` is cut
-    out by linearizations of its slack, which takes longer. Of a non-convex set a convex part counts.
+    A batched interior-point method in float64. A set that does not describe its `superlevel` is
+    cut out by linearizations of its slack, which takes longer. Of a non-convex set a convex part
+    counts.
 
     Args:
         sets: sets of batch shape ``(B,)``, the first a finite box.
