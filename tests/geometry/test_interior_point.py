@@ -45,11 +45,11 @@ def test_newton_steps_are_those_of_autograd(kinds: tuple[int, ...]) -> None:
 
     def objective(x: Tensor) -> Tensor:
         at = Point(x[None, :dim], x[dim : dim + 1], x[dim + 1 :].view_as(start.terms))
-        return (problem.barrier(at) - eta * at.slack)[0]
+        return (problem.barrier(problem.distances(at)) - eta * at.slack)[0]
 
     gradient = torch.autograd.functional.jacobian(objective, x)
     step = -torch.linalg.solve(torch.autograd.functional.hessian(objective, x), gradient)
-    move, decrement = newton(problem, start, eta)
+    move, decrement = newton(problem, start, problem.distances(start), eta)
     given = torch.cat([move.action[0], move.slack, move.terms.flatten()])
     torch.testing.assert_close(given, step, rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(decrement[0], -gradient @ step, rtol=1e-9, atol=1e-12)

@@ -16,6 +16,9 @@ from cnfp_torchrl.geometry.shapes import broadcast_shape
 STEPS = 6
 """Steps inwards: more decide tighter states, which the search takes otherwise."""
 
+REFINEMENTS = (3, 3, 4)
+"""Steps inwards between looks at which states need more of them."""
+
 SHARE = 0.3
 """The share of the best slack with which an attempt is content."""
 
@@ -88,6 +91,32 @@ def further_attempt(
     ascent = Ascent(sets, before.anchor, before.upper)
     ascent.run(steps)
     return _roomiest(sets, depths, [ascent.point, before.anchor], ascent.bound)
+
+
+def refined_attempt(
+    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt
+) -> Attempt:
+    """Go on with steps inwards, and look now and then which states need more of them.
+
+    Args:
+        sets: of batch shape ``(B,)``, as is all else.
+        depths: that their rows ask for.
+        before: where to begin.
+    """
+    anchor, upper, decided = (each.clone() for each in before)
+    left = torch.arange(len(decided), device=decided.device)
+    for steps in REFINEMENTS:
+        found = further_attempt(sets, depths, before, steps)
+        anchor[left], upper[left], decided[left] = found
+        hard = (~found.decided).nonzero().squeeze(-1)
+        if not len(hard):
+            break
+        if len(hard) < len(left):
+            sets = [each.select(found.decided.shape, hard) for each in sets]
+            depths = [each[hard] for each in depths]
+            left, found = left[hard], found.select(hard)
+        before = found
+    return Attempt(anchor, upper, decided)
 
 
 def _roomiest(

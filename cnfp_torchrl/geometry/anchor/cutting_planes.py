@@ -75,7 +75,7 @@ def maximize_slack_by_cuts(
         if not bool(undecided.any()):
             break
         offsets = slacks - needs - (gradients * best.action.unsqueeze(-2)).sum(-1)
-        problem = problem.with_rows(-gradients, offsets, tried.to(slacks), on.to(slacks))
+        problem = problem.with_rows(-gradients, offsets, tried.to(slacks), on)
         problem, left = problem.select(undecided), left[undecided]
     return found
 

@@ -14,13 +14,13 @@ from typing import NamedTuple, Self, TypeAlias
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program, weigh
+from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program
 
 MAX_ITERATIONS = 150
 """Newton steps after which the best point so far must do; some 15 are usual, 50 rare."""
 
-_GROWTH = 8.0
-_TRIALS = 8
+_GROWTH = 20.0
+_TRIALS = 6
 
 
 class Best(NamedTuple):
@@ -55,37 +55,60 @@ def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Sett
     found = Best(start.clone(), problem.slack(start), upper_bound)
     # The eta for which the start is best in t.
     eta = _pull_on_slack(problem, at)
-    nu = problem.barrier_parameter()
+    nu = float(problem.barrier_parameter())
     left = torch.arange(len(start), device=start.device)
+    lower, upper, action = found.slack, upper_bound, at.action
     for _ in range(MAX_ITERATIONS):
-        undecided = ~settled(found.slack[left], found.upper_bound[left], left)
+        undecided = ~settled(lower, upper, left)
         if not bool(undecided.all()):
+            found = _settle(found, left, lower, upper, action)
             if not bool(undecided.any()):
-                break
+                return found
             problem, left = problem.select(undecided), left[undecided]
-            nu, eta = nu[undecided], eta[undecided]
-            at = Point(*(each[undecided] for each in at))
-        move, squared = newton(problem, at, eta)
+            lower, upper, action = lower[undecided], upper[undecided], action[undecided]
+            eta, at = eta[undecided], Point(*(each[undecided] for each in at))
+        distances = problem.distances(at)
+        slack = at.slack + problem.gained(distances)
+        action = torch.where((slack > lower).unsqueeze(-1), at.action, action)
+        lower = torch.maximum(slack, lower)
+        move, squared = newton(problem, at, distances, eta)
         # The absolute value, because a negative one is all rounding error.
         decrement = squared.abs().sqrt()
         near = decrement < 0.5
-        gap = (nu + (decrement + nu.sqrt()) * decrement / (1 - decrement)) / eta
-        upper = torch.where(near, at.slack + gap, torch.inf)
-        slack = problem.slack(at.action)
-        better = slack > found.slack[left]
-        found.action[left] = torch.where(better.unsqueeze(-1), at.action, found.action[left])
-        found.slack[left] = torch.where(better, slack, found.slack[left])
-        found.upper_bound[left] = torch.minimum(found.upper_bound[left], upper)
+        gap = (nu + (decrement + nu**0.5) * decrement / (1 - decrement)) / eta
+        upper = torch.minimum(upper, torch.where(near, at.slack + gap, torch.inf))
         at = _line_search(problem, at, move, eta, decrement)
         eta = torch.where(near, eta * _GROWTH, eta)
-    return found
+    return _settle(found, left, lower, upper, action)
 
 
-def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
-    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``."""
-    distances = problem.distances(at)
-    gradient, hessian = _rows_and_cones(problem, at, distances)
+def _settle(found: Best, index: Tensor, lower: Tensor, upper: Tensor, action: Tensor) -> Best:
+    """Return what was found with the bounds and actions of some of the problems."""
+    return Best(
+        found.action.index_copy(0, index, action),
+        found.slack.index_copy(0, index, lower),
+        found.upper_bound.index_copy(0, index, upper),
+    )
+
+
+def newton(problem: Program, at: Point, distances: Distances, eta: Tensor) -> tuple[Point, Tensor]:
+    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``.
+
+    Args:
+        problem: B problems.
+        at: strictly feasible points.
+        distances: of these points from the inequalities.
+        eta: weights of t, ``(B,)``.
+    """
+    inverse = distances.rows.reciprocal().unsqueeze(-1)
+    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
+    gradient, hessian = rows.sum(-2), rows.mT @ rows
     gradient[:, -1] -= eta
+    if problem.has_cones:
+        _add_cones(problem, at, distances, gradient, hessian)
+    if not problem.has_sums:
+        move = -_solve(hessian, gradient)
+        return Point(move[:, :-1], move[:, -1], at.terms), -(gradient * move).sum(-1)
     sums = _KinkedSums.at(problem, distances)
     own, eliminated = sums.gradients()
     hessian = hessian + sums.reduced_hessian()
@@ -95,23 +118,22 @@ def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
     return Point(move[:, :-1], move[:, -1], terms), decrement
 
 
-def _rows_and_cones(problem: Program, at: Point, s: Distances) -> tuple[Tensor, Tensor]:
-    """Return gradient and Hessian in (action, slack) of the barriers of rows and cones."""
-    inverse = weigh(problem.row_weights, s.rows, torch.reciprocal).unsqueeze(-1)
-    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
-    # Cones: -log(h^2 - |y|^2), with z half of its gradient times h^2 - |y|^2.
+def _add_cones(
+    problem: Program, at: Point, s: Distances, gradient: Tensor, hessian: Tensor
+) -> None:
+    """Add the barriers of cones, ``-log(h^2 - |y|^2)``, to gradient and Hessian in (action, t)."""
     white = problem.white(at.action)
     height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    inverse = 2 * weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
+    inverse = 2 / (s.cone_gaps * s.cone_sums)
+    # Half of the gradient times h^2 - |y|^2.
     pulled = (problem.matrices * white.unsqueeze(-1)).sum(-2)
     z = torch.cat([pulled, (height * problem.cone_rates).unsqueeze(-1)], -1)
     z = z * inverse.unsqueeze(-1)
-    gradient = rows.sum(-2) + z.sum(-2)
-    hessian = rows.mT @ rows + z.mT @ z
+    gradient += z.sum(-2)
+    hessian += z.mT @ z
     matrices = (problem.matrices * inverse.sqrt()[..., None, None]).flatten(1, 2)
     hessian[:, :-1, :-1] += matrices.mT @ matrices
     hessian[:, -1, -1] -= (inverse * problem.cone_rates.square()).sum(-1)
-    return gradient, hessian
 
 
 class _KinkedSums(NamedTuple):
@@ -132,11 +154,8 @@ class _KinkedSums(NamedTuple):
 
     @classmethod
     def at(cls, problem: Program, s: Distances) -> Self:
-        weights = problem.sum_weights.unsqueeze(-1)
-        p = weigh(weights, s.upper, torch.reciprocal)
-        q = weigh(weights, s.lower, torch.reciprocal)
-        r = weigh(problem.sum_weights, s.sums, torch.reciprocal)
-        curvature = torch.where(weights > 0, p.square() + q.square(), 1.0)
+        p, q, r = s.upper.reciprocal(), s.lower.reciprocal(), s.sums.reciprocal()
+        curvature = p.square() + q.square()
         kappa = r.square() / (1 + r.square() * curvature.reciprocal().sum(-1))
         pull = problem.upper * p.square() + problem.lower * q.square()
         return cls(problem, p, q, r, curvature, pull, r.unsqueeze(-1) - p - q, kappa)
@@ -175,11 +194,13 @@ def _joined(action: Tensor, slack: Tensor) -> Tensor:
 
 def _pull_on_slack(problem: Program, at: Point) -> Tensor:
     s = problem.distances(at)
-    height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    rows = weigh(problem.row_weights, s.rows, torch.reciprocal) * problem.row_rates
-    cones = weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
-    sums = weigh(problem.sum_weights, s.sums, torch.reciprocal) * problem.sum_rates
-    return rows.sum(-1) + (2 * cones * height * problem.cone_rates).sum(-1) + sums.sum(-1)
+    pull = (problem.row_rates / s.rows).sum(-1)
+    if problem.has_cones:
+        height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
+        pull = pull + (2 * height * problem.cone_rates / (s.cone_gaps * s.cone_sums)).sum(-1)
+    if problem.has_sums:
+        pull = pull + (problem.sum_rates / s.sums).sum(-1)
+    return pull
 
 
 def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decrement: Tensor) -> Point:
@@ -187,7 +208,7 @@ def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decremen
     share = torch.linspace(1, 0, _TRIALS, dtype=eta.dtype, device=eta.device).unsqueeze(-1)
     steps = (1 + decrement) ** -share
     trials = at.moved(move, steps)
-    value = problem.barrier(trials) - eta * (steps * move.slack)
+    value = problem.barrier(problem.distances(trials)) - eta * (steps * move.slack)
     best = steps.gather(0, value.argmin(0, keepdim=True)).squeeze(0)
     return at.moved(move, best)
 

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.attempts import first_attempt, further_attempt
+from cnfp_torchrl.geometry.anchor.attempts import first_attempt, refined_attempt
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
 from cnfp_torchrl.geometry.anchor.interior_point import Best
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
@@ -29,9 +29,6 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 LEEWAY = 1e-3
 """By how much relaxed rows give way beyond the least amount, as a share of the bounds' width."""
-
-ATTEMPTS = (3, 3, 4)
-"""Steps inwards between looks at which states need more of them."""
 
 
 @torch.no_grad()
@@ -71,22 +68,18 @@ def lexicographic_anchor(
     relaxation = [each.new_zeros(*shape, each.shape[-1]) for each in depths]
     left = (~found.decided).flatten().nonzero().squeeze(-1)
     if len(left):
-        found = found.select(left)
+        # Steps inwards for the states that need them, and the search for those that need more.
         sets = [each.select(shape, left) for each in sets]
         depths = [_flat(each, shape)[left] for each in depths]
-        margin = (leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left]).squeeze(-1)
-    # Steps inwards for the states that need them, and the search for those that need more.
-    for steps in ATTEMPTS:
-        if not len(left):
-            break
-        found = further_attempt(sets, depths, found, steps)
+        found = refined_attempt(sets, depths, found.select(left))
         anchor = anchor.index_copy(0, left, found.anchor)
         hard = (~found.decided).nonzero().squeeze(-1)
         sets = [each.select(found.decided.shape, hard) for each in sets]
         depths = [each[hard] for each in depths]
-        found, left, margin = found.select(hard), left[hard], margin[hard]
+        found, left = found.select(hard), left[hard]
     if len(left):
-        searched = Search.of(sets, torch.cat(depths, -1), margin).run()
+        margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
+        searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active)
         for each, rows in zip(relaxation, searched.relaxation, strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, Self
 
@@ -47,24 +47,21 @@ class Distances(NamedTuple):
 class Program:
     """B problems "maximize t such that all sets have slack t", as stacks of rows, cones and sums.
 
-    Fields carry B first; each inequality has a weight of 1, or of 0 where it is to be ignored, and
-    a rate of 0 where it must hold whatever t is.
+    Fields carry B first. An inequality has a rate of 0 where it must hold whatever t is. One that
+    does not count has no coefficients, a size of 1 and a rate of 0: it holds by 1 everywhere.
     """
 
     rows: Tensor
     row_offsets: Tensor
     row_rates: Tensor
-    row_weights: Tensor
     matrices: Tensor
     vectors: Tensor
     cone_sizes: Tensor
     cone_rates: Tensor
-    cone_weights: Tensor
     upper: Tensor
     lower: Tensor
     sum_sizes: Tensor
     sum_rates: Tensor
-    sum_weights: Tensor
 
     @classmethod
     def stack(cls, parts: Sequence[Superlevel], batch: int) -> Self:
@@ -87,15 +84,10 @@ class Program:
             sizes = [piece.shape[-1 - len(shape) :] for piece in pieces]
             return torch.cat([p.expand(batch, *n) for p, n in zip(pieces, sizes, strict=True)], 1)
 
-        offsets = joined([p.offsets for p in rows])
-        finite = offsets.isfinite()
-        cone_rates = joined([p.rate[..., None] for p in cones])
-        sum_rates = joined([p.rate[..., None] for p in sums])
-        return cls(
+        program = cls(
             rows=joined([p.normals for p in rows], dim),
-            row_offsets=torch.where(finite, offsets, 1.0),
+            row_offsets=joined([p.offsets for p in rows]),
             row_rates=joined([p.rates for p in rows]),
-            row_weights=finite.to(like),
             matrices=joined(
                 [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p in cones], height, dim
             ),
@@ -103,15 +95,15 @@ class Program:
                 [_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height
             ),
             cone_sizes=joined([p.size[..., None] for p in cones]),
-            cone_rates=cone_rates,
-            cone_weights=torch.ones_like(cone_rates),
+            cone_rates=joined([p.rate[..., None] for p in cones]),
             upper=joined([torch.maximum(p.upper, p.lower)[..., None, :] for p in sums], dim),
             lower=joined([torch.minimum(p.upper, p.lower)[..., None, :] for p in sums], dim),
             sum_sizes=joined([p.size[..., None] for p in sums]),
-            sum_rates=sum_rates,
-            # Without weights every action passes.
-            sum_weights=(sum_rates > 0).to(like),
+            sum_rates=joined([p.rate[..., None] for p in sums]),
         )
+        # Infinite offsets and sums without weights let every action pass.
+        finite, cones_count = program.row_offsets.isfinite(), program.cone_rates > 0
+        return program._where(finite, cones_count, program.sum_rates > 0)
 
     def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
@@ -123,38 +115,64 @@ class Program:
         """
         sizes = [self.row_rates.shape[-1], self.cone_rates.shape[-1], self.sum_rates.shape[-1]]
         needs, trials, on = (each.split(sizes, -1) for each in (required, trial, counts))
-        return replace(
+        shifted = replace(
             self,
             row_offsets=self.row_offsets - self.row_rates * needs[0],
             row_rates=self.row_rates * trials[0],
-            row_weights=self.row_weights * on[0],
             cone_sizes=self.cone_sizes - self.cone_rates * needs[1],
             cone_rates=self.cone_rates * trials[1],
-            cone_weights=self.cone_weights * on[1],
             sum_sizes=self.sum_sizes - self.sum_rates * needs[2],
             sum_rates=self.sum_rates * trials[2],
-            sum_weights=self.sum_weights * on[2],
         )
+        return shifted._where(*(each > 0 for each in on))
+
+    def _where(self, rows: Tensor, cones: Tensor, sums: Tensor) -> Self:
+        """Return the problems of the inequalities that count."""
+
+        def kept(value: Tensor, mask: Tensor, otherwise: float = 0.0) -> Tensor:
+            return torch.where(mask[(...,) + (None,) * (value.ndim - mask.ndim)], value, otherwise)
+
+        return type(self)(
+            rows=kept(self.rows, rows),
+            row_offsets=kept(self.row_offsets, rows, 1.0),
+            row_rates=kept(self.row_rates, rows),
+            matrices=kept(self.matrices, cones),
+            vectors=kept(self.vectors, cones),
+            cone_sizes=kept(self.cone_sizes, cones, 1.0),
+            cone_rates=kept(self.cone_rates, cones),
+            upper=kept(self.upper, sums),
+            lower=kept(self.lower, sums),
+            sum_sizes=kept(self.sum_sizes, sums, 1.0),
+            sum_rates=kept(self.sum_rates, sums),
+        )
+
+    @property
+    def has_cones(self) -> bool:
+        """Whether there are any second-order cones."""
+        return self.matrices.shape[1] > 0
+
+    @property
+    def has_sums(self) -> bool:
+        """Whether there are any kinked sums."""
+        return self.upper.shape[1] > 0
 
     def select(self, keep: Tensor) -> Self:
         """Return some of the B problems."""
         return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
-    def with_rows(self, normals: Tensor, offsets: Tensor, rates: Tensor, weights: Tensor) -> Self:
-        """Return the problems with rows ``(B, m, d)`` added."""
+    def with_rows(self, normals: Tensor, offsets: Tensor, rates: Tensor, counts: Tensor) -> Self:
+        """Return the problems with rows ``(B, m, d)`` added, where they count."""
         return replace(
             self,
-            rows=torch.cat([self.rows, normals], 1),
-            row_offsets=torch.cat([self.row_offsets, offsets], 1),
-            row_rates=torch.cat([self.row_rates, rates], 1),
-            row_weights=torch.cat([self.row_weights, weights], 1),
+            rows=torch.cat([self.rows, normals * counts.unsqueeze(-1)], 1),
+            row_offsets=torch.cat([self.row_offsets, torch.where(counts, offsets, 1.0)], 1),
+            row_rates=torch.cat([self.row_rates, rates * counts], 1),
         )
 
-    def barrier_parameter(self) -> Tensor:
-        """Return nu, ``(B,)``: one for each row, two for each cone, two a kinked term."""
+    def barrier_parameter(self) -> int:
+        """Return nu: one for each row, two for each cone, two and one a kinked sum's terms."""
         terms = 2 * self.upper.shape[-1] + 1
-        weights = (self.row_weights.sum(-1), 2 * self.cone_weights.sum(-1))
-        return weights[0] + weights[1] + terms * self.sum_weights.sum(-1)
+        return self.rows.shape[1] + 2 * self.matrices.shape[1] + terms * self.upper.shape[1]
 
     def slack(self, action: Tensor) -> Tensor:
         """Return the smallest slack at an action, ``(B,)``."""
@@ -175,7 +193,7 @@ class Program:
 
     def _rooms(self, action: Tensor) -> Tensor:
         """Return by how much each inequality holds at a slack of zero."""
-        rows = self.row_offsets - torch.einsum("bmd,...bd->...bm", self.rows, action)
+        rows = self.row_offsets - (self.rows @ action.unsqueeze(-1)).squeeze(-1)
         cones = self.cone_sizes - vector_norm(self.white(action), dim=-1)
         sums = self.sum_sizes - self._terms(action).sum(-1)
         return torch.cat([rows, cones, sums], -1)
@@ -183,9 +201,7 @@ class Program:
     def _smallest(self, rooms: Tensor) -> Tensor:
         """Return the smallest slack of those that rooms leave."""
         rates = torch.cat([self.row_rates, self.cone_rates, self.sum_rates], -1)
-        weights = torch.cat([self.row_weights, self.cone_weights, self.sum_weights], -1)
-        counts = (weights > 0) & (rates > 0)
-        return torch.where(counts, rooms / torch.where(counts, rates, 1.0), torch.inf).amin(-1)
+        return torch.where(rates > 0, rooms / rates, torch.inf).amin(-1)
 
     def start(self, action: Tensor, margin: Tensor) -> Point:
         """Return a strictly feasible point at an action, its slack a margin below the possible."""
@@ -194,46 +210,48 @@ class Program:
         room = self.sum_sizes - self.sum_rates * slack.unsqueeze(-1) - terms.sum(-1)
         return Point(action, slack, terms + (room / (2 * action.shape[-1])).unsqueeze(-1))
 
-    def barrier(self, at: Point) -> Tensor:
+    def gained(self, s: Distances) -> Tensor:
+        """Return by how much t could be larger at the action of a point, ``(B,)``."""
+        parts = [s.rows / self.row_rates]
+        if self.has_cones:
+            parts.append(s.cone_gaps / self.cone_rates)
+        if self.has_sums:
+            parts.append(s.sums / self.sum_rates)
+        return (torch.cat(parts, -1) if len(parts) > 1 else parts[0]).amin(-1)
+
+    def barrier(self, s: Distances) -> Tensor:
         """Return the barrier's value ``(*trials, B)``, infinite where a point is not feasible."""
-        s = self.distances(at)
-        value = weigh(self.row_weights, s.rows, torch.log).sum(-1)
-        for gaps in (s.cone_gaps, s.cone_sums):
-            value = value + weigh(self.cone_weights, gaps, torch.log).sum(-1)
-        value = value + weigh(self.sum_weights, s.sums, torch.log).sum(-1)
-        for terms in (s.upper, s.lower):
-            value = value + weigh(self.sum_weights.unsqueeze(-1), terms, torch.log).sum((-2, -1))
-        return torch.where(torch.isnan(value), torch.inf, -value)
+        value = s.rows.log().sum(-1)
+        if self.has_cones:
+            value = value + (s.cone_gaps.log() + s.cone_sums.log()).sum(-1)
+        if self.has_sums:
+            value = value + s.sums.log().sum(-1)
+            value = value + (s.upper.log() + s.lower.log()).sum((-2, -1))
+        return -value.nan_to_num(nan=-torch.inf, posinf=torch.inf)
 
     def distances(self, at: Point) -> Distances:
         """Return by how much each inequality holds; none may be negative."""
-        action, slack = at.action.unsqueeze(-2), at.slack.unsqueeze(-1)
-        height = self.cone_sizes - self.cone_rates * slack
-        length = vector_norm(self.white(at.action), dim=-1)
-        return Distances(
-            rows=self.row_offsets
-            - torch.einsum("bmd,...bd->...bm", self.rows, at.action)
-            - self.row_rates * slack,
-            cone_gaps=height - length,
-            cone_sums=height + length,
-            upper=at.terms - self.upper * action,
-            lower=at.terms - self.lower * action,
-            sums=self.sum_sizes - self.sum_rates * slack - at.terms.sum(-1),
-        )
+        slack = at.slack.unsqueeze(-1)
+        rows = self.row_offsets - self.row_rates * slack
+        rows = rows - (self.rows @ at.action.unsqueeze(-1)).squeeze(-1)
+        gaps = sums = upper = lower = totals = rows[..., :0]
+        if self.has_cones:
+            height = self.cone_sizes - self.cone_rates * slack
+            length = vector_norm(self.white(at.action), dim=-1)
+            gaps, sums = height - length, height + length
+        if self.has_sums:
+            action = at.action.unsqueeze(-2)
+            upper, lower = at.terms - self.upper * action, at.terms - self.lower * action
+            totals = self.sum_sizes - self.sum_rates * slack - at.terms.sum(-1)
+        return Distances(rows, gaps, sums, upper, lower, totals)
 
     def white(self, action: Tensor) -> Tensor:
         """Return ``W a + y`` of each cone, ``(*trials, B, J, k)``."""
-        return torch.einsum("bjkd,...bd->...bjk", self.matrices, action) + self.vectors
+        return (self.matrices @ action[..., None, :, None]).squeeze(-1) + self.vectors
 
     def _terms(self, action: Tensor) -> Tensor:
         action = action.unsqueeze(-2)
         return torch.maximum(self.upper * action, self.lower * action)
-
-
-def weigh(weights: Tensor, values: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return a function of the values where the weight is 1, and 0 where it is 0."""
-    counts = weights > 0
-    return torch.where(counts, function(torch.where(counts, values, 1.0)), 0.0)
 
 
 def _rows_padded(tensor: Tensor, height: int, axis: int) -> Tensor:

@@ -9,6 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cnfp_torchrl.geometry.anchor.attempts import (
+    Attempt,
+    further_attempt,
+    refined_attempt,
+)
 from cnfp_torchrl.geometry.anchor.interior_point import Best
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
@@ -73,10 +78,20 @@ class Search:
     def of(cls, sets: Sequence[ConstraintSet], depth: Tensor, leeway: Tensor) -> Search:
         return cls(Intersection.of(sets), depth.double(), leeway.double())
 
-    def run(self) -> Anchored:
-        """Apply the rule."""
-        together = ~self.far
-        fits = self._fit(together)
+    def run(self, upper: Tensor) -> Anchored:
+        """Apply the rule.
+
+        Args:
+            upper: upper bounds of the best slack in all sets, if they are convex, ``(B,)``.
+        """
+        fits = torch.zeros_like(self.far[:, 0])
+        # Where even a slack of less than 0 is out of reach, there is no need to look for more.
+        open_ = upper > -self.depth.amin(-1) if all(self.everything.convex) else ~fits
+        left = open_.nonzero().squeeze(-1)
+        if len(left):
+            some = Search(self.everything.select(left), self.depth[left], self.leeway[left])
+            fits[left] = some._fit(~some.far)
+            self.kept[left] = some.kept
         # Far rows hold or give way wherever the anchor is.
         rooms = self.everything.row_slacks(self.kept) - self.depth
         fits = fits & ((rooms >= 0) | ~self.far).all(-1)
@@ -115,7 +130,49 @@ class Search:
                 self.dropped[:, k] = left
                 rows = rows & ~left.unsqueeze(-1)
             self.counts = self.counts | rows
-        self._fit(self.counts)
+            if k > 1:
+                self._step_inwards(k)
+        self._anchor()
+
+    def _anchor(self) -> None:
+        """Move well inside of what is left, by steps inwards where they suffice."""
+        if self._has_odd_sets():
+            self._fit(self.counts)
+            return
+        found = refined_attempt(*self._widened(1))
+        self.kept = found.anchor
+        left = (~found.decided).nonzero().squeeze(-1)
+        if len(left):
+            some = Search(self.everything.select(left), self.depth[left], self.leeway[left])
+            some.relaxation, some.kept = self.relaxation[left], self.kept[left]
+            some._fit(self.counts[left])
+            self.kept[left] = some.kept
+
+    def _step_inwards(self, k: int) -> None:
+        """Move away from the boundaries of set k and those before it, for a better start."""
+        if not self._has_odd_sets():
+            self.kept = further_attempt(*self._widened(k), steps=3).anchor
+
+    def _has_odd_sets(self) -> bool:
+        """Tell whether steps inwards do not see all that counts."""
+        return not all(self.everything.convex) or bool(self.far.any() | self.dropped.any())
+
+    def _widened(self, k: int) -> tuple[list[ConstraintSet], list[Tensor], Attempt]:
+        """Return bounds and sets from k on as relaxed so far, their depths, and the kept points."""
+        amounts = self.relaxation.split(self.everything.widths, -1)
+        depths = self.depth.split(self.everything.widths, -1)
+        sets = [self.everything.sets[0]] + [
+            each.inflated(amount) if each.can_be_inflated() else each
+            for each, amount in zip(self.everything.sets[k:], amounts[k:], strict=True)
+        ]
+        bounds = self.everything.bounds
+        upper = (bounds.high - bounds.low).amin(-1) / 2
+        # A row that gives way is left with no more room than the depth that it kept and the leeway.
+        room = (1 + PRECISION) * self.depth + self.leeway.unsqueeze(-1)
+        room = torch.where(self.relaxation > 0, room, torch.inf).amin(-1)
+        undecided = torch.zeros_like(self.far[:, 0])
+        start = Attempt(self.kept, torch.minimum(upper, room), undecided)
+        return sets, [depths[0], *depths[k:]], start
 
     def _give_way(self, k: int, trial: Tensor) -> None:
         """Relax the rows on trial by lexicographic minimax."""
