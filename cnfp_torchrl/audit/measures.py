@@ -180,7 +180,7 @@ def worst_scene(trial: Trial, name: str, source: str) -> tuple[float, Scene]:
     here = trial.head.get_region(trial.states[s])
     tried = [x[:, s].cpu() for x in (trial.actions, inside, bad, dead_end)]
     entries = trial.described(s)["state"]
-    return float(against[s]), Scene(name, source, why, entries, here.to("cpu"), *tried)
+    return float(against[s]), Scene(name, source, why, entries, here.to(device="cpu"), *tried)
 
 
 def executed(

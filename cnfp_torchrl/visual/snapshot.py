@@ -15,8 +15,8 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.bijectors import has_latent
 from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
-from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY
 from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 
@@ -199,7 +199,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     latents = loc + scale * noise.to(loc)
     latent_log_density = base.log_prob(latents).cpu()
     actions, log_dets = (each.cpu() for each in staged.forward(latents))
-    on_host = region.to("cpu")
+    on_host = region.to(device="cpu")
     stages = tuple(
         Stage(
             name,

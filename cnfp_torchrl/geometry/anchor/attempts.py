@@ -10,8 +10,7 @@ from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from cnfp_torchrl.geometry.anchor.depth import row_depths
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
 STEPS = 6
 """Steps inwards: more decide tighter states, which the search takes otherwise."""
