@@ -4,31 +4,12 @@ from __future__ import annotations
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.rays import scaled_direction
 from cnfp_torchrl.modules import ConstrainedFlowModule
-from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
-
-
-class StandStill(TensorDictModuleBase):
-    """Always the zero action.
-
-    Args:
-        head: the flow module of an actor, which knows the action's key and size.
-    """
-
-    def __init__(self, head: ConstrainedFlowModule) -> None:
-        super().__init__()
-        self.head = head
-        self.in_keys: list[NestedKey] = []
-        self.out_keys = [head.action_key]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write zeros."""
-        zeros = self.head.low.new_zeros(*tensordict.shape, *self.head.low.shape)
-        return tensordict.set(self.head.action_key, zeros)
+from cnfp_torchrl.tasks.point_nav.layout import Layout
+from cnfp_torchrl.tasks.point_nav.shortest_path import ShortestPath
 
 
 class ShortestPathPolicy(TensorDictModuleBase):
@@ -36,7 +17,7 @@ class ShortestPathPolicy(TensorDictModuleBase):
 
     Args:
         head: the flow module of an actor, which knows the region.
-        layout: the map of point navigation.
+        layout: the map; None takes the reference task.
     """
 
     def __init__(self, head: ConstrainedFlowModule, layout: Layout | None = None) -> None:
