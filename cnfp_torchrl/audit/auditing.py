@@ -33,9 +33,7 @@ from cnfp_torchrl.audit.rollouts import roll_out
 from cnfp_torchrl.audit.samples import draw_samples
 from cnfp_torchrl.audit.states import bare, state_keys, uniform_states
 from cnfp_torchrl.configuration import require_fields
-from cnfp_torchrl.envs import constraint_bijectors
-from cnfp_torchrl.envs.cost import Indicator
-from cnfp_torchrl.envs.task_view import StateSetter, find_task_view
+from cnfp_torchrl.envs import Indicator, StateSetter, constraint_bijectors, find_task_view
 from cnfp_torchrl.modules import ConstrainedFlowModule, ConstraintBijector, Flow, flow_head
 
 

@@ -15,7 +15,6 @@ from cnfp_torchrl.audit.report import TOGETHER, ConstraintMetrics, Executed, Wor
 from cnfp_torchrl.audit.rollouts import Rollouts
 from cnfp_torchrl.audit.samples import Samples, describe_state
 from cnfp_torchrl.audit.statistics import Share, plain, quantiles
-from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 
@@ -174,13 +173,9 @@ def worst_state(samples: Samples, name: str, source: str) -> tuple[float, WorstS
     here = samples.head.get_region(samples.states[s])
     tried = [x[:, s].cpu() for x in (samples.actions, inside, bad, dead_end)]
     entries = samples.describe_state(s)["state"]
-    return float(against[s]), WorstState(name, source, reason, entries, _on_host(here), *tried)
-
-
-def _on_host(region: Region) -> Region:
-    sets = tuple(each.with_fields(lambda value, _: value.cpu()) for each in region.sets)
-    assert region.active is not None
-    return Region(sets, region.anchor.cpu(), region.active.cpu())
+    return float(against[s]), WorstState(
+        name, source, reason, entries, here.to(device="cpu"), *tried
+    )
 
 
 def executed(

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cnfp_torchrl.envs.cost import COST_KEY
-from cnfp_torchrl.envs.task_view import StateSetter
+from cnfp_torchrl.envs import StateSetter
+from cnfp_torchrl.keys import COST_KEY
 
 LARGEST_ENTRY = 64
 """Entries of a state with more numbers, such as pictures, are not written down."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.geometry import broadcast_shape
 
 
 class SquashChain(Bijector):
@@ -48,15 +48,6 @@ class SquashChain(Bijector):
             latent, log_det = bijector.inverse_and_log_det(latent)
             total = total + log_det
         return latent, total
-
-    def contains(self, action: Tensor) -> Tensor:
-        inside = torch.ones_like(action[..., 0], dtype=torch.bool)
-        for bijector in reversed(self.bijectors):
-            inside = inside & bijector.contains(action)
-            interior = bijector.forward_and_log_det(torch.zeros_like(action))[0]
-            action = torch.where(inside.unsqueeze(-1), action, interior)
-            action = bijector.inverse_and_log_det(action)[0]
-        return inside
 
     def stages(self, latent: Tensor) -> Stages:
         action = latent.expand(broadcast_shape(latent.shape, self.shape))

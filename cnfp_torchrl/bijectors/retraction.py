@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.rays import Rays
-from cnfp_torchrl.geometry import ConstraintSet
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.bijectors.region_squash import contraction_along_rays
+from cnfp_torchrl.geometry import Box, ConstraintSet, broadcast_shape
 
 
 class Retraction(Bijector):
@@ -27,7 +26,7 @@ class Retraction(Bijector):
 
     def __init__(self, outer: ConstraintSet, inner: ConstraintSet, anchor: Tensor) -> None:
         super().__init__()
-        inner = inner.eroded(outer.bounding_box().magnitude())
+        inner = inner.eroded(Box(*outer.bounding_box(), validate_args=False).magnitude())
         self._outer, self._inner, self._anchor = outer, inner, anchor
         self._outer_gauge = outer.gauge_about(anchor)
         self._inner_gauge = inner.gauge_about(anchor)
@@ -41,19 +40,18 @@ class Retraction(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         offset = latent - self._anchor
-        contraction = self._contraction(offset)
+        _, contraction = self._progress_and_contraction(offset)
         action = self._anchor + offset / contraction.unsqueeze(-1)
         return action, -latent.shape[-1] * contraction.log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         offset = action - self._anchor
-        contraction = self._contraction(offset)
+        progress, contraction = self._progress_and_contraction(offset)
+        # A way that leaves the outer set has no argument.
+        contraction = torch.where(progress * contraction < 1, contraction, torch.nan)
         latent = self._anchor + offset * contraction.unsqueeze(-1)
         return latent, action.shape[-1] * contraction.log()
 
-    def contains(self, action: Tensor) -> Tensor:
-        offset = action - self._anchor
-        return self._outer_gauge(offset) * self._contraction(offset) < 1
-
-    def _contraction(self, offset: Tensor) -> Tensor:
-        return Rays(offset, self._outer_gauge(offset)).contraction([self._inner_gauge])
+    def _progress_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor]:
+        progress = self._outer_gauge(offset)
+        return progress, contraction_along_rays(offset, progress, [self._inner_gauge])

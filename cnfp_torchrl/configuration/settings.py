@@ -66,6 +66,7 @@ PAIRS = Expected("a list of pairs such as [[0, 1]]", _list_of(lambda _: True))
 EXPECTED = {
     "seed": WHOLE,
     "threads": COUNT,
+    "compile": FLAG,
     "batch": COUNT,
     "env.agents": COUNT,
     "env.order": NAMES,
@@ -90,6 +91,7 @@ EXPECTED = {
     "training.warmup_frames": WHOLE,
     "training.update_ratio": NOT_NEGATIVE,
     "training.log_interval": COUNT,
+    "training.constraint_bytes": WHOLE,
     "evaluation.episodes": COUNT,
     "evaluation.seed": WHOLE,
     "audit.states": COUNT,

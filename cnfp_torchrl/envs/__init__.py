@@ -1,22 +1,53 @@
 """Transforms that publish an environment's constraints into the tensordict."""
 
 from cnfp_torchrl.envs.action_guard import ActionGuard
-from cnfp_torchrl.envs.anchor_transform import (
-    ConstraintAnchor,
-    constrain_env,
-    constraint_bijectors,
-)
-from cnfp_torchrl.envs.cost import ConstraintCost, constraint_names
+from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.constrain_env import constrain_env
+from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
+from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs.task_view import (
+    NOTHING,
+    Boxes,
+    Discs,
+    Map,
+    Marks,
+    Polyline,
+    Series,
+    Shape,
+    StateSetter,
+    TaskView,
+    find_task_view,
+)
+
+# Whoever has an environment in hand looks for these here.
+from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
 __all__ = [
+    "NOTHING",
     "ActionGuard",
+    "Boxes",
     "ConstraintAnchor",
     "ConstraintCost",
+    "Discs",
     "GeometryTransform",
+    "Indicator",
+    "Map",
+    "Marks",
+    "PackedStates",
+    "Polyline",
     "RewardPenalty",
+    "SampledGeometry",
+    "Series",
+    "Shape",
+    "StateSetter",
+    "TaskView",
+    "appended_transforms",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
+    "constraints_to_sample",
+    "find_task_view",
 ]

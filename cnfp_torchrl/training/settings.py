@@ -17,6 +17,8 @@ class TrainingSettings:
         warmup_frames: environment steps with safe random actions, before the actor acts and learns.
         update_ratio: updates for each environment step.
         log_interval: environment steps between two entries of the log.
+        constraint_bytes: memory that a stored transition may take for constraints; sets that do not
+            fit are computed anew at sampling, which takes a little time.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -25,6 +27,7 @@ class TrainingSettings:
     warmup_frames: int = 1000
     update_ratio: float = 0.5
     log_interval: int = 400
+    constraint_bytes: int = 64
 
     def __post_init__(self) -> None:
         require_fields("training", self)

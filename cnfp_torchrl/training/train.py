@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
@@ -34,6 +33,8 @@ from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_s
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings, require_frames
+from cnfp_torchrl.training.storage import prepare_buffer
+from cnfp_torchrl.training.update import Update
 
 
 def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
@@ -72,16 +73,24 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
+    update = Update(loss, optimizer, target, compiled=config.compile)
 
     # Collector and replay buffer
     policy = WarmUpPolicy(actor, settings.warmup_frames)
+    if config.compile:
+        # Not the policy around it, which counts: a number that changes would be compiled anew.
+        policy.actor = torch.compile(actor)
     collector = instantiate(config.collector, _partial_=True)(env, policy)
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
-    stored = [*actor.in_keys, "action"]
-    stored += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
-    stored += [key for key in [("next", "cost")] if key in loss.in_keys]
+    stored = prepare_buffer(
+        buffer,
+        env,
+        actor.in_keys,
+        other_keys=[key for key in [("next", "cost")] if key in loss.in_keys],
+        constraint_bytes=settings.constraint_bytes,
+    )
 
     # Callback and loggers
     callback: TrainingCallback = NoCallback()
@@ -98,14 +107,6 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         interval=settings.log_interval,
     )
 
-    def update() -> TensorDictBase:
-        losses = loss(buffer.sample())
-        optimizer.zero_grad()
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        optimizer.step()
-        target.step()
-        return losses
-
     updates_due = 0.0
     with closing(callback):
         for collected in collector:
@@ -116,7 +117,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             if metrics.frames >= settings.warmup_frames:
                 updates_due += batch.numel() * settings.update_ratio
                 while updates_due >= 1:
-                    metrics.add_losses(update())
+                    metrics.add_losses(update(buffer.sample()))
                     updates_due -= 1
             metrics.log_if_due()
         metrics.finish()

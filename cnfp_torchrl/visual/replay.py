@@ -10,10 +10,9 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import SquashChain
-from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.bijectors import SquashChain, has_latent
+from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import flow_head
-from cnfp_torchrl.modules.constraint_bijector import require
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, snapshot_of
 from cnfp_torchrl.visual.staged_flow import StagedFlow
 
@@ -53,18 +52,12 @@ def replay_step(
     return _with_executed(snapshot_of(head, state, noise), action.cpu())
 
 
-def in_float64(region: Region) -> Region:
-    """Return a region in float64."""
-    sets = tuple(each.to(torch.float64) for each in region.sets)
-    return Region(sets, region.anchor.double(), region.active, validate_args=False)
-
-
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     """Return the snapshot with the executed action before all samples."""
-    region = in_float64(snapshot.region)
+    region = snapshot.region.to(torch.float64)
     staged = StagedFlow(snapshot.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
-    latent = staged.inverse(given[None])[0][-1]
+    latent, inverse_log_det = (each[-1] for each in staged.inverse(given[None]))
     path, log_dets = staged.forward(latent)
     path = path.squeeze(1)
     if isinstance(staged.last, SquashChain):
@@ -76,9 +69,11 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
         path = given.expand(len(snapshot.stages), -1)
     path = torch.cat([path[:-1], given[None]])
     samples = _before(path[:, None], torch.stack([stage.samples for stage in snapshot.stages]))
-    log_density = _before(
-        latent_log_density - log_dets, torch.stack([each.log_density for each in snapshot.stages])
+    # A saturated action has lost its latent: as the distribution does, take the density's limit.
+    of_action = (latent_log_density - log_dets).masked_fill(
+        ~has_latent(latent, inverse_log_det), -torch.inf
     )
+    log_density = _before(of_action, torch.stack([each.log_density for each in snapshot.stages]))
     stages = tuple(
         replace(stage, samples=samples[i], log_density=log_density[i])
         for i, stage in enumerate(snapshot.stages)

@@ -119,15 +119,26 @@ def test_copies(copied: Callable[[TransformedEnv], TransformedEnv]) -> None:
     assert torch.equal(again["constraints", "anchor"], same["constraints", "anchor"])
 
 
-def test_the_action_bounds_move_with_the_environment() -> None:
+def test_another_dtype_does_not_move_the_action_bounds() -> None:
     env = point_nav(3)
     env.reset()
-    buffers = dict(env.transform[-1].to("meta").named_buffers())
-    assert {name: bound.device.type for name, bound in buffers.items()} == {
-        "_low": "meta",
-        "_high": "meta",
-    }
-    assert not env.transform[-1].state_dict()
+    anchor = env.transform[-1]
+    before = anchor.clone()
+    anchor.half()
+    assert not anchor.state_dict()
+    state = env.reset()
+    assert torch.equal(
+        before(state.clone())["constraints", "anchor"], state["constraints", "anchor"]
+    )
+
+
+def test_a_clone_of_an_anchor_keeps_the_bounds_though_nothing_was_reset() -> None:
+    env = point_nav(3)
+    clone = env.transform[-1].clone()
+    state = env.reset()
+    assert torch.equal(
+        clone(state.clone())["constraints", "anchor"], state["constraints", "anchor"]
+    )
 
 
 # Inside -------------------------------------------------------------------------------------------
@@ -318,7 +329,8 @@ def test_in_a_replay_buffer_it_fills_in_what_was_not_stored() -> None:
         stored = rollout if here is sample else rollout["next"]
         index = (here["observation"].unsqueeze(1) == stored["observation"]).all(-1).int().argmax(1)
         for key in (("constraints", "anchor"), *(("constraints", n, "active") for n in ORDER)):
-            assert torch.equal(here[key], stored[key][index])
+            # Computed anew in a batch of another order and shape: up to rounding.
+            torch.testing.assert_close(here[key], stored[key][index])
 
 
 def test_transitions_without_a_next_state_are_fine() -> None:
@@ -326,7 +338,7 @@ def test_transitions_without_a_next_state_are_fine() -> None:
     state = env.reset()
     bare = state.exclude(("constraints", "anchor"))
     filled = env.transform[-1].clone()(bare)
-    assert torch.equal(filled["constraints", "anchor"], state["constraints", "anchor"])
+    torch.testing.assert_close(filled["constraints", "anchor"], state["constraints", "anchor"])
     assert "next" not in filled.keys()  # noqa: SIM118 - a tensordict iterates over its batch
 
 

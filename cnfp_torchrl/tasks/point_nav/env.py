@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs.task_view import TaskView
+from cnfp_torchrl.envs import TaskView
 from cnfp_torchrl.tasks.point_nav.dynamics import (
     CONSTRAINT_NAMES,
     Collision,

@@ -12,8 +12,16 @@ from torch import Tensor
 from torch.linalg import vector_norm
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs.geometry_transform import appended_transforms
-from cnfp_torchrl.envs.task_view import Boxes, Discs, Map, Marks, Polyline, Series, TaskView
+from cnfp_torchrl.envs import (
+    Boxes,
+    Discs,
+    Map,
+    Marks,
+    Polyline,
+    Series,
+    TaskView,
+    appended_transforms,
+)
 from cnfp_torchrl.tasks.point_nav.geometry import (
     BatteryGeometry,
     PointNavGeometry,
