@@ -41,9 +41,9 @@ def test_an_untrained_flow_keeps_constraints_that_appear_later(run: RunFolder) -
     for modes in results.values():
         for outcome in modes.values():
             assert (outcome.episodes, outcome.steps) == (40, 4000)
-            if config.flow.combine._target_.split(".")[-1] == "ExactFlow":
+            if config.flow._target_.split(".")[-1] == "ExactFlow":
                 assert outcome.violations == {"obstacle": 0, "battery": 0}
-    if config.flow.combine._target_.endswith("UnconstrainedFlow"):
+    if config.flow._target_.endswith("UnconstrainedFlow"):
         before = outcomes(run, config)["stochastic"].violations
         second = results["second rectangle"]["stochastic"].violations
         reserve = results["stricter battery reserve"]["stochastic"].violations

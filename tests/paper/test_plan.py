@@ -38,7 +38,7 @@ def test_seeds_are_the_outer_loop() -> None:
     assert settings["seed"] == 4
     assert settings["collector"]["total_frames"] == 800
     assert settings["optim"]["lr"] == 0.01
-    assert settings["flow"]["combine"]["_target_"].endswith("SquashFlow")
+    assert settings["flow"]["_target_"].endswith("SquashFlow")
     assert not {"figures", "logger", "visual", "hydra"} & set(settings)
 
 

@@ -12,15 +12,8 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from cnfp_torchrl.audit import (
-    FLAWS_FOUND,
-    AuditReport,
-    AuditSettings,
-    as_text,
-    audit,
-    audit_configured,
-    main,
-)
+from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
+from cnfp_torchrl.commands.audit import FLAWS_FOUND, audit_configured, main
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
@@ -62,7 +55,7 @@ def test_the_shipped_geometry_passes(make_config: Callable[..., DictConfig]) -> 
     assert found(report, "uniform", "battery", "dropped")["count"] > 0
     assert found(report, "rollouts", "together", "dropped")["count"] == 0
     assert found(report, "rollouts", "obstacle", "coverage")["share"] > 0.9
-    assert "no flaw found" in as_text(report)
+    assert "no flaw found" in str(report)
 
 
 class WrongSign(ObstacleGeometry):
@@ -119,9 +112,9 @@ def test_wrong_geometry_is_caught_with_its_state(
     violated = dict(zip(env.constraint_names, judged["next", "cost"].tolist(), strict=True))
     assert violated[guilty] == 1
     assert example["violates"] == [name for name, cost in violated.items() if cost]
-    assert f"{guilty}, rollouts, worst of unsound" in as_text(report)
-    (scene,) = (each for each in report.scenes if each.name == guilty)
-    assert "violate" in scene.why
+    assert f"{guilty}, rollouts, worst of unsound" in str(report)
+    (scene,) = (each for each in report.worst_states if each.name == guilty)
+    assert "violate" in scene.reason
     assert bool((scene.inside & scene.violates).any())
 
 
@@ -142,7 +135,7 @@ def test_optimistic_plans_lead_to_dead_ends() -> None:
 
 def test_the_figure_shows_the_worst_states(tmp_path: Path) -> None:
     report = audited(BatteryGeometry(), WallsOnly(), states=16, actions=8)
-    assert [scene.name for scene in report.scenes] == ORDER
+    assert [scene.name for scene in report.worst_states] == ORDER
     text = [t.get_text() for t in audit_figure(report).findobj() if hasattr(t, "get_text")]
     assert any("in the set violate" in each for each in text)
     path = save_audit(report, tmp_path / "audit.png")
@@ -154,7 +147,7 @@ def test_a_trained_run_is_audited(
     make_config: Callable[..., DictConfig],
     tiny_run: Callable[..., tuple[RunFolder, dict[str, Any]]],
 ) -> None:
-    folder, _ = tiny_run("flow=radial", "flow.order=[obstacle,battery]")
+    folder, _ = tiny_run("flow=radial", "env.order=[obstacle,battery]")
     report = audit_configured(make_config(*QUICK, f"run={folder.path}", name="audit"))
     assert report.order == ("obstacle", "battery")
     assert report.subject["flow"] == "RadialFlow"
@@ -171,7 +164,7 @@ def test_a_trained_run_is_audited(
         ("audit.strict=maybe", "audit.strict: expected true or false, given 'maybe'"),
         ("batch=0", "batch: expected a whole number >= 1, given 0"),
         ("batch=many", "batch: expected a whole number >= 1, given 'many'"),
-        ("flow.obstacle=visble", r"flow.obstacle: expected one of \['box', 'visible'\]"),
+        ("env.order=battery", "env.order: expected a list"),
         ("run=absent", "lacks"),
     ],
 )

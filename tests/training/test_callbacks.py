@@ -25,11 +25,11 @@ from torchrl.envs import EnvBase
 
 from cnfp_torchrl.modules import guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.callbacks import EpisodeRecorder, replay_episodes, show_episodes
 from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
-from cnfp_torchrl.training.watching import EpisodeCollector, replay_episodes, watch_run
 from cnfp_torchrl.visual.stream import Recording, RunningViewer
 from tests.visual.stream.recorded import read
 
@@ -60,7 +60,7 @@ from hydra import compose, initialize_config_dir
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
-import cnfp_torchrl.training.evaluate
+import cnfp_torchrl.commands.evaluate
 with initialize_config_dir(str(config_directory()), version_base="1.3"):
     train(compose("train", overrides=sys.argv[2:]), RunFolder.create(sys.argv[1]))
 assert "rerun" not in sys.modules
@@ -96,15 +96,15 @@ def evaluated(monkeypatch: pytest.MonkeyPatch) -> dict[bool, list[list[TensorDic
     """The first two episodes of a training's evaluations, by whether they are deterministic."""
     episodes = {}
 
-    def spied(*given: Any, deterministic: bool, see: Callable | None, **options: Any) -> Evaluation:
-        kept = EpisodeCollector(range(2))
+    def spied(*given: Any, deterministic: bool, on_step: Callable, **options: Any) -> Evaluation:
+        kept = EpisodeRecorder(range(2))
 
         def look(transition: TensorDictBase) -> None:
             kept(transition)
-            if see is not None:
-                see(transition)
+            if on_step is not None:
+                on_step(transition)
 
-        result = evaluate_seeded(*given, deterministic=deterministic, see=look, **options)
+        result = evaluate_seeded(*given, deterministic=deterministic, on_step=look, **options)
         episodes[deterministic] = list(kept.episodes.values())
         return result
 
@@ -157,7 +157,7 @@ def test_a_stream_that_fails_costs_no_results(
     def fail(*_: Any) -> None:
         raise OSError("no stream")
 
-    monkeypatch.setattr("cnfp_torchrl.visual.stream.watch.WatchedTraining.see_episode", fail)
+    monkeypatch.setattr("cnfp_torchrl.visual.stream.watch.WatchedTraining.on_episode", fail)
     with pytest.raises(OSError, match="no stream"):
         tiny_run(*FILE)
     folder = RunFolder.open(tmp_path / "run1")
@@ -296,16 +296,16 @@ def test_replayed_episodes_are_those_of_the_evaluation(
         total = sum(float(step["next", "reward"]) for step in episode)
         assert total == pytest.approx(float(expected[number]), rel=1e-5)
 
-    watch = instantiate({"_target_": "cnfp_torchrl.visual.stream.Watch", "episodes": 2})
+    factory = instantiate({"_target_": "cnfp_torchrl.visual.stream.Watch", "episodes": 2})
     path = tmp_path / "recording.rrd"
-    watch_run(folder, settings, watch, path).close()
+    show_episodes(folder, settings, factory, path).close()
     assert steps_of(path, "/explanation") == list(range(24))
     words = read(path, "/explanation", "TextDocument:text")[19].item()
     assert words.startswith("Evaluation, episode 1, step 7 of 12, stochastic policy: **")
 
 
 def test_episodes_of_an_environment_without_batch_follow_each_other() -> None:
-    kept = EpisodeCollector([1])
+    kept = EpisodeRecorder([1])
     for step, done in enumerate([False, True, False, False, True, True]):
         kept(TensorDict({"step": step, "next": {"done": torch.tensor([done])}}, []))
     assert [int(each["step"]) for each in kept.episodes[1]] == [2, 3, 4]

@@ -16,7 +16,7 @@ REFUSED = {
     "seed": (WHOLE, ["-3", "abc", "null", "1.5", "true"]),
     "threads": (COUNT, ["0", "abc", "null"]),
     "env.agents": (COUNT, ["0", "abc", "true"]),
-    "flow.order": ("a list of names", ["battery", "[0,1]", "null"]),
+    "env.order": ("a list of the constraints' names", ["battery", "[0,1]", "null"]),
     "env.score.zero": ("a finite number", ["abc", "null", "nan", "inf"]),
     "env.score.one": ("another return than env.score.zero", ["-104.0"]),
     "network.hidden": ("a list of whole numbers >= 1", ["64", "[0]", "[64,wide]"]),
@@ -36,7 +36,7 @@ REFUSED = {
 }
 REFUSED_OF_OPTIONS = {
     "experiment=penalty env.penalty.penalty": ("a finite number > 0", "abc"),
-    "experiment=squash_radius_4 flow.combine.max_radius": ("a number > 0", "abc"),
+    "experiment=squash_radius_4 flow.max_radius": ("a number > 0", "abc"),
     "experiment=lagrangian loss.gamma_cost": ("a discount", "abc"),
     "experiment=lagrangian loss.thresholds": ("a list of finite numbers >= 0", "[0,-1]"),
     "experiment=lagrangian loss.lambda_init": ("a finite number > 0", "abc"),

@@ -21,7 +21,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration.directory import config_directory
 
 BUILT = ("env", "flow", "network", "evaluation")
 """The sections of a run's configuration that are built again when the run is read."""

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,9 +17,7 @@ import yaml
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from cnfp_torchrl.training.agent import build_actor, build_environment
-from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
-from cnfp_torchrl.training.trust import (
+from cnfp_torchrl.configuration.trust import (
     BUILT,
     FOREIGN,
     nameable,
@@ -28,6 +25,9 @@ from cnfp_torchrl.training.trust import (
     require_trusted,
     targets,
 )
+from cnfp_torchrl.training.agent import build_actor, build_environment
+from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
+from tests.entry_points import load_command
 
 PATH = Path("run/config.yaml")
 CALL = "cnfp_torchrl.training.run_folder.torch.load"
@@ -278,7 +278,7 @@ def test_plain_data_is_what_was_written(tmp_path: Path) -> None:
         GYM | {"env_name": "ALE/Pong-v5", "render_mode": "rgb_array"},
         GYM | {"_args_": ["cnfp_torchrl/PointNav-v0"], "_convert_": "all"},
         GYM | {"env_name": "FrozenLake-v1", "map_name": "8x8", "is_slippery": False},
-        {"_target_": "cnfp_torchrl.training.baselines.StandStill", "_partial_": True},
+        {"_target_": "cnfp_torchrl.training.evaluation.StandStill", "_partial_": True},
         {"_target_": "cnfp_torchrl.modules.SafeRandomPolicy", "_partial_": True},
     ],
 )
@@ -356,9 +356,8 @@ def test_every_command_refuses(
 ) -> None:
     given = [each.format(run=evil_run, place=tmp_path / "out") for each in COMMANDS[command]]
     monkeypatch.setattr(sys, "argv", [command, *given])
-    (script,) = entry_points(group="console_scripts", name=command)
     with pytest.raises(SystemExit):
-        script.load()()
+        load_command(command)()
     said = capsys.readouterr().err
     assert CALL in said
     assert str(evil_run / CONFIG) in said

@@ -1,4 +1,4 @@
-"""The actions that an audit tries in each state, what they led to, and how that is written down."""
+"""Samples of actions in the states of an audit, and what each of them leads to."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from cnfp_torchrl.audit.probes import Probe
-from cnfp_torchrl.audit.report import plain
+from cnfp_torchrl.audit.lookahead import Lookahead
+from cnfp_torchrl.audit.statistics import plain
 from cnfp_torchrl.geometry import ConstraintSet, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
@@ -26,19 +26,19 @@ UNIFORM = "uniform in the action bounds"
 
 
 @dataclass(frozen=True)
-class Trial:
-    """All actions tried in n states, m from the flow and then m uniform ones, and judgments.
+class Samples:
+    """Actions in n states, m from the flow and then m uniform ones, with what they lead to.
 
     Args:
-        head: the flow.
-        states: ``(n,)``.
-        keys: the entries of a state that say which one it is.
+        head: the flow module.
+        states: the states, ``(n,)``.
+        keys: the entries of a state that identify it.
         region: the sets, anchors and flags of the states.
-        actions: ``(2 m, n, d)``.
-        reachable: whether the flow can reach each action, ``(2 m, n)``.
-        violated: by constraint; False where no indicator judges, ``(2 m, n, K)``.
-        kept: whether each constraint is active in the next state, ``(2 m, n, K)``.
-        judged: whether a constraint has an indicator, K of them.
+        actions: the actions, ``(2 m, n, d)``.
+        reachable: mask of the actions that the flow can reach, ``(2 m, n)``.
+        violated: mask of violations by constraint, False without an indicator, ``(2 m, n, K)``.
+        kept: mask of the constraints that are active in the next state, ``(2 m, n, K)``.
+        judged: flags of the constraints that have an indicator, K of them.
     """
 
     head: ConstrainedFlowModule
@@ -62,54 +62,54 @@ class Trial:
         assert self.region.active is not None
         return self.region.active[..., 1:]
 
-    def tried(self, row: int, state: int) -> dict[str, Any]:
+    def describe(self, row: int, state: int) -> dict[str, Any]:
         """Return one action in its state as plain values."""
         latents = LATENTS[row % len(LATENTS)]
         flags = self.violated[row, state].tolist()
         return {
-            **self.described(state),
+            **self.describe_state(state),
             "action": plain(self.actions[row, state]),
             "drawn": latents if row < self.half else UNIFORM,
             "violates": [name for name, bad in zip(self.head.order, flags, strict=True) if bad],
         }
 
-    def described(self, state: int) -> dict[str, Any]:
+    def describe_state(self, state: int) -> dict[str, Any]:
         """Return a state as plain values: its entries, and each constraint's set."""
-        return describe(self.head, self.states[state], self.keys)
+        return describe_state(self.head, self.states[state], self.keys)
 
 
-def run_trial(
-    probe: Probe,
+def draw_samples(
+    lookahead: Lookahead,
     head: ConstrainedFlowModule,
     keys: Sequence[NestedKey],
     indicators: Sequence[str],
     actions: int,
-) -> Trial:
-    """Draw actions in every state, through the flow and uniformly, and have them judged.
+) -> Samples:
+    """Draw actions in every state, through the flow and uniformly, and look one step ahead.
 
     Args:
-        probe: the states.
-        head: the flow.
-        keys: the entries of a state that say which one it is.
-        indicators: the names of what the probe judges by.
+        lookahead: the states, and what actions lead to in them.
+        head: the flow module.
+        keys: the entries of a state that identify it.
+        indicators: the names of the indicators that judge steps.
         actions: number of each kind in each state.
     """
-    states, bounds = probe.states, head.bounds
+    states, bounds = lookahead.states, head.bounds
     bijector = head.get_bijector(states)
     latents = draw_latents(actions, len(states), bounds.dim).to(bounds.low)
     sampled, _ = bijector.forward_and_log_det(latents)
     uniform = bounds.low + (bounds.high - bounds.low) * torch.rand_like(latents)
-    tried = torch.cat([sampled, uniform])
-    outcome = probe.outcome(tried)
+    drawn = torch.cat([sampled, uniform])
+    outcome = lookahead.outcome(drawn)
     unjudged = torch.zeros_like(outcome.violated[..., 0])
     columns = dict(zip(indicators, outcome.violated.unbind(-1), strict=True))
-    return Trial(
+    return Samples(
         head,
         states,
         keys,
         head.get_region(states),
-        tried,
-        bijector.contains(tried),
+        drawn,
+        bijector.contains(drawn),
         torch.stack([columns.get(name, unjudged) for name in head.order], dim=-1),
         outcome.kept,
         tuple(name in indicators for name in head.order),
@@ -126,7 +126,7 @@ def draw_latents(rows: int, states: int, dim: int) -> Tensor:
     return scale * torch.randn(rows, states, dim)
 
 
-def describe(
+def describe_state(
     head: ConstrainedFlowModule, state: TensorDictBase, keys: Sequence[NestedKey]
 ) -> dict[str, Any]:
     """Return a state ``()`` as plain values: its entries, and each constraint's set."""
@@ -136,14 +136,14 @@ def describe(
     return {
         "state": {_name(key): plain(state.get(key)) for key in keys},
         "sets": {
-            name: {"family": type(each).__name__, "active": active, **_plain_fields(each)}
-            for name, each, active in zip(head.order, region.sets[1:], flags, strict=True)
+            name: {"family": type(allowed).__name__, "active": active, **_plain_fields(allowed)}
+            for name, allowed, active in zip(head.order, region.sets[1:], flags, strict=True)
         },
     }
 
 
-def _plain_fields(each: ConstraintSet) -> dict[str, Any]:
-    return {name: plain(value) for name, value in each.fields().items()}
+def _plain_fields(allowed: ConstraintSet) -> dict[str, Any]:
+    return {name: plain(value) for name, value in allowed.fields().items()}
 
 
 def _name(key: NestedKey) -> str:

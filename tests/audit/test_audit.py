@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cnfp_torchrl.audit import AuditReport, AuditSettings, Findings, Share, as_text, audit
+from cnfp_torchrl.audit import AuditReport, AuditSettings, ConstraintMetrics, Share, audit
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball
 from cnfp_torchrl.visual.audit_figure import audit_figure
@@ -57,7 +57,7 @@ class Disc(EnvBase):
         return
 
 
-def place(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+def set_state(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
     return env.reset(limit=states["observation"])
 
 
@@ -84,7 +84,7 @@ def with_geometry(base: EnvBase, geometry: GeometryTransform) -> TransformedEnv:
     return env.append_transform(ConstraintAnchor(constraint_bijectors(env)))
 
 
-def of(report: AuditReport, source: str, name: str = "disc") -> Findings:
+def of(report: AuditReport, source: str, name: str = "disc") -> ConstraintMetrics:
     (found,) = (each for each in report.sources[source] if each.name == name)
     return found
 
@@ -97,7 +97,7 @@ def reports() -> Callable[..., AuditReport]:
         key = (share, dropped_below)
         if key not in made:
             env = with_geometry(Disc(512), Share_(*key))
-            made[key] = audit(env, place=place, settings=SMALL)
+            made[key] = audit(env, state_setter=set_state, settings=SMALL)
         return made[key]
 
     return make
@@ -150,7 +150,6 @@ def test_too_large_a_set_is_caught_with_its_state(reports: Callable[..., AuditRe
     (example, *_) = report.executed.examples["disc"]
     assert torch.tensor(example["action"]).norm() > example["state"]["observation"][0]
     text = str(report)
-    assert text == as_text(report)
     assert "FLAW: disc, uniform" in text
     assert f"{report.flaws[0].split(': ')[1].split(' actions')[0]}" in text
 
@@ -186,7 +185,7 @@ def test_dead_ends_are_flaws_where_that_is_asked_for() -> None:
     indicators = {"disc": lambda before, after: torch.zeros(256, dtype=torch.bool)}
     for strict in (False, True):
         settings = AuditSettings(states=32, actions=8, steps=2, strict=strict, uniform=False)
-        report = audit(env, place=place, indicators=indicators, settings=settings)
+        report = audit(env, state_setter=set_state, indicators=indicators, settings=settings)
         found = of(report, "rollouts")
         # Every step draws another limit, so that 2 in 5 actions lead to where it is dropped.
         assert found.dead_ends.low < 0.4 < found.dead_ends.high
@@ -234,7 +233,7 @@ class FreshWalk(Walk, Fresh):
 
 @pytest.mark.parametrize(
     ("base", "message"),
-    [(FreshWalk, "steps to another 'observation'"), (Uncopied, r"but one.*place")],
+    [(FreshWalk, "steps to another 'observation'"), (Uncopied, r"but one.*state_setter")],
 )
 def test_environments_that_cannot_be_copied_are_refused(base: type[Disc], message: str) -> None:
     env = with_geometry(base(4), Share_(0.8))
@@ -242,46 +241,54 @@ def test_environments_that_cannot_be_copied_are_refused(base: type[Disc], messag
         audit(env, settings=AuditSettings(states=4, actions=4, steps=3))
 
 
-def test_a_place_for_the_bare_environment_and_its_observation_is_enough() -> None:
-    def place_bare(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+def test_a_state_setter_of_the_bare_environment_and_its_observation_is_enough() -> None:
+    def set_bare_state(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
         assert type(env) is FreshWalk
         env.limit = states["observation"].clone()
         return TensorDict({"observation": env.limit}, env.batch_size)
 
     env = with_geometry(FreshWalk(64), Share_(1.05))
-    report = audit(env, place=place_bare, settings=SMALL)
+    report = audit(env, state_setter=set_bare_state, settings=SMALL)
     assert list(report.sources) == ["rollouts", "uniform"]
     assert any(flaw.startswith("disc, uniform") for flaw in report.flaws)
 
 
-def test_a_place_that_misses_is_refused() -> None:
+def test_a_state_setter_that_misses_is_refused() -> None:
     env = with_geometry(Disc(4), Share_(0.8))
     with pytest.raises(ValueError, match="shows another 'observation'"):
-        audit(env, place=lambda env, states: env.reset(), settings=AuditSettings(states=4, steps=1))
+        audit(
+            env,
+            state_setter=lambda env, states: env.reset(),
+            settings=AuditSettings(states=4, steps=1),
+        )
 
 
 def test_own_indicators_judge() -> None:
     env = with_geometry(Disc(256, cost=False), Share_(1.05))
     settings = AuditSettings(states=32, actions=32, steps=5)
-    report = audit(env, place=place, indicators={"disc": over, "other": over}, settings=settings)
+    report = audit(
+        env, state_setter=set_state, indicators={"disc": over, "other": over}, settings=settings
+    )
     unsound = of(report, "uniform").unsound
     assert unsound is not None
     assert unsound.count > 0
     assert any("other" in note for note in report.notes)
     with pytest.raises(ValueError, match="expected one for at least one of the constraints"):
-        audit(env, place=place, indicators={"other": over}, settings=settings)
+        audit(env, state_setter=set_state, indicators={"other": over}, settings=settings)
 
 
 def test_a_constraint_without_indicator_is_not_judged() -> None:
     env = TransformedEnv(Disc(256), Share_(0.8))
     env.append_transform(Share_(0.9, name="second"))
     env.append_transform(ConstraintAnchor(constraint_bijectors(env)))
-    report = audit(env, place=place, settings=AuditSettings(states=16, actions=16, steps=5))
+    report = audit(
+        env, state_setter=set_state, settings=AuditSettings(states=16, actions=16, steps=5)
+    )
     found = of(report, "uniform", "second")
     assert found.unsound is found.coverage is found.possible is None
     assert found.volume["median"] is not None
     assert any(note.startswith("second: no indicator") for note in report.notes)
-    assert "not judged" in as_text(report)
+    assert "not judged" in str(report)
     assert audit_figure(report)
 
 
@@ -310,7 +317,9 @@ def test_json_holds_the_whole_report(reports: Callable[..., AuditReport]) -> Non
 def test_the_same_seed_finds_the_same() -> None:
     settings = AuditSettings(states=10, actions=8, steps=5)
     first, second = (
-        audit(with_geometry(Disc(4), Share_(1.05)), place=place, settings=settings).as_dict()
+        audit(
+            with_geometry(Disc(4), Share_(1.05)), state_setter=set_state, settings=settings
+        ).as_dict()
         for _ in range(2)
     )
     assert first == second

@@ -4,30 +4,10 @@ from __future__ import annotations
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 
 from cnfp_torchrl.modules import ConstrainedFlowModule
-from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
-
-
-class StandStill(TensorDictModuleBase):
-    """Always the zero action.
-
-    Args:
-        head: the flow module of an actor, which knows the action's key and size.
-    """
-
-    def __init__(self, head: ConstrainedFlowModule) -> None:
-        super().__init__()
-        self.head = head
-        self.in_keys: list[NestedKey] = []
-        self.out_keys = [head.action_key]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write zeros."""
-        bounds = self.head.bounds
-        zeros = bounds.low.new_zeros(*tensordict.shape, bounds.dim)
-        return tensordict.set(self.head.action_key, zeros)
+from cnfp_torchrl.tasks.point_nav.layout import Layout
+from cnfp_torchrl.tasks.point_nav.shortest_path import ShortestPath
 
 
 class ShortestPathPolicy(TensorDictModuleBase):
@@ -35,7 +15,7 @@ class ShortestPathPolicy(TensorDictModuleBase):
 
     Args:
         head: the flow module of an actor, which knows the region.
-        layout: the map of point navigation.
+        layout: the map; None takes the reference task.
     """
 
     def __init__(self, head: ConstrainedFlowModule, layout: Layout | None = None) -> None:
@@ -52,6 +32,5 @@ class ShortestPathPolicy(TensorDictModuleBase):
         waypoint = self.path.to_goal(position, goal)
         wish = (waypoint - position) / self.path.layout.step_length
         wish = wish / wish.norm(dim=-1, keepdim=True).clamp(min=1)
-        return tensordict.set(
-            self.head.action_key, self.head.get_region(tensordict).eroded().pulled_in(wish)
-        )
+        inside = self.head.get_region(tensordict).eroded().pulled_in(wish)
+        return tensordict.set(self.head.action_key, inside)

@@ -1,4 +1,4 @@
-"""How an environment is asked what actions would lead to, without a step of its own."""
+"""One-step lookahead: what actions would lead to, without a step of the environment itself."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from cnfp_torchrl.audit.states import Place, bare, difference
-from cnfp_torchrl.envs import Indicator, constraint_names
+from cnfp_torchrl.audit.states import bare, difference
+from cnfp_torchrl.envs import Indicator, StateSetter, constraint_names
 from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
@@ -28,8 +28,8 @@ class Outcome(NamedTuple):
     """Whether each constraint is active in the next state, bool ``(m, n, K)``."""
 
 
-class Reader:
-    """Read indicators and active flags off a step.
+class StepReader:
+    """Reads indicators and active flags off a step.
 
     Args:
         env: the environment.
@@ -82,45 +82,49 @@ class Reader:
         return Outcome(self.violated(before, outcome), self.active(outcome) | ended.any(-1, True))
 
 
-class Probe(ABC):
-    """States ``(n,)`` in which an environment can be asked what any action would lead to."""
+class Lookahead(ABC):
+    """States ``(n,)`` with a model of one step from each of them."""
 
     states: TensorDictBase
 
     @abstractmethod
     def outcome(self, actions: Tensor) -> Outcome:
-        """Return what actions ``(m, n, d)`` lead to, each one tried in its own state."""
+        """Return what actions ``(m, n, d)`` lead to, each one in its own state."""
 
 
-class PlacedProbe(Probe):
-    """Asks by putting the environment into each state again, as many at once as its batch holds.
+class StateSetterLookahead(Lookahead):
+    """Puts the environment into each state again, as many at once as its batch holds.
 
     Args:
         env: the environment.
-        place: how to put it into a state.
-        states: ``(n,)``, as the environment returned them.
-        reader: of steps.
+        state_setter: puts the environment into states.
+        states: the states ``(n,)``, as the environment returned them.
+        reader: what reads indicators and flags.
 
     Raises:
         ValueError: by `outcome`, when the environment then shows another state.
     """
 
-    def __init__(self, env: EnvBase, place: Place, states: TensorDictBase, reader: Reader) -> None:
-        self.env, self.place, self.states, self.reader = env, place, states, reader
+    def __init__(
+        self, env: EnvBase, state_setter: StateSetter, states: TensorDictBase, reader: StepReader
+    ) -> None:
+        self.env, self.state_setter = env, state_setter
+        self.states, self.reader = states, reader
 
     def outcome(self, actions: Tensor) -> Outcome:
         flat = actions.flatten(0, 1)
         size, shape = self.env.batch_size.numel(), self.env.batch_size
         found = []
         for first in range(0, len(flat), size):
-            # The last batch is filled up with pairs that are asked twice.
+            # The last batch is filled up with a pair of state and action that is repeated.
             pair = torch.arange(first, first + size).clamp(max=len(flat) - 1)
             states = self.states[pair % len(self.states)].reshape(shape)
-            shown = self.place(bare(self.env), states)
+            shown = self.state_setter(bare(self.env), states)
             if (key := difference(self.env, states, shown)) is not None:
+                name = type(bare(self.env)).__name__
                 raise ValueError(
-                    f"place: expected a function that puts {type(bare(self.env)).__name__} into "
-                    f"given states, but then it shows another {key!r}"
+                    f"state_setter: expected a function that puts {name} into given states, but "
+                    f"then it shows another {key!r}"
                 )
             action = flat[pair].reshape(*shape, -1)
             found.append([x.reshape(size, -1) for x in self.reader.step(self.env, states, action)])
@@ -128,15 +132,15 @@ class PlacedProbe(Probe):
         return Outcome(*(x.unflatten(0, actions.shape[:2]) for x in (violated, kept)))
 
 
-class CopiedProbe(Probe):
-    """Asks copies of the environment, one for each action, made while it stood in the states.
+class CopyLookahead(Lookahead):
+    """Steps copies of the environment that were made while it stood in the states.
 
     Args:
         copies: environments with their current states, of the environment's batch size.
-        reader: of steps.
+        reader: what reads indicators and flags.
     """
 
-    def __init__(self, copies: list[tuple[EnvBase, TensorDictBase]], reader: Reader) -> None:
+    def __init__(self, copies: list[tuple[EnvBase, TensorDictBase]], reader: StepReader) -> None:
         self.copies, self.reader = copies, reader
         self.states: TensorDictBase = torch.cat([states.reshape(-1) for _, states in copies])
 
@@ -147,8 +151,8 @@ class CopiedProbe(Probe):
         with bar:
             for (env, states), block in zip(self.copies, actions.split(size, dim=1), strict=True):
                 rows = []
-                for each in block:
-                    action = each.reshape(*states.batch_size, -1)
+                for row in block:
+                    action = row.reshape(*states.batch_size, -1)
                     outcome = self.reader.step(copy.deepcopy(env), states, action)
                     rows.append([x.reshape(size, -1) for x in outcome])
                     bar.update()

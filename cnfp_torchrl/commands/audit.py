@@ -1,24 +1,24 @@
-"""Hold a constraint's geometry against the environment's own indicators: ``cnfp-audit``."""
+"""Hold constraint sets against the environment's own indicators: the command ``cnfp-audit``."""
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
-from omegaconf import DictConfig
+from cnfp_torchrl.commands.extras import needs_extra
 
-from cnfp_torchrl.audit.auditing import AuditSettings, audit
-from cnfp_torchrl.audit.report import AuditReport
-from cnfp_torchrl.configuration import config_directory
-from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import require_settings
-from cnfp_torchrl.whole_file import whole_file
+with needs_extra("train"):
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.utils import instantiate
+    from omegaconf import DictConfig
+
+    from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
+    from cnfp_torchrl.configuration import config_directory, require_settings
+    from cnfp_torchrl.training.agent import application_order, build_environment, load_actor
+    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.whole_file import write_json
 
 FLAWS_FOUND = 3
 """The exit code where flaws were found; 1 is an audit that could not be done."""
@@ -35,10 +35,10 @@ def audit_configured(config: DictConfig) -> AuditReport:
     env = build_environment(chosen, batch_size=[config.batch], with_anchor=True)
     return audit(
         env,
-        order=list(chosen.flow.order),
-        flow=instantiate(chosen.flow.combine),
+        order=application_order(chosen),
+        flow=instantiate(chosen.flow),
         actor=None if folder is None else load_actor(folder, chosen, env),
-        place=instantiate(chosen.env.get("place")),
+        state_setter=instantiate(chosen.env.get("state_setter")),
         settings=settings,
     )
 
@@ -47,13 +47,15 @@ def audit_configured(config: DictConfig) -> AuditReport:
 def main(config: DictConfig) -> None:
     """Audit, print tables, write ``audit.json`` and ``audit.png``; exit with 3 for a flaw."""
     report = audit_configured(config)
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    text = json.dumps(report.as_dict(), indent=2, allow_nan=False)
-    with whole_file(folder / "audit.json") as file:
-        file.write(f"{text}\n".encode())
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    write_json(directory / "audit.json", report.as_dict())
     draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
     if draw is not None:
-        draw(report, folder / "audit.png")
-    sys.stdout.write(f"{report}\n{folder}\n")
+        draw(report, directory / "audit.png")
+    sys.stdout.write(f"{report}\n{directory}\n")
     if report.flaws:
         sys.exit(FLAWS_FOUND)
+
+
+if __name__ == "__main__":
+    main()
