@@ -58,7 +58,7 @@ class ConstrainedFlow(TransformedDistribution):
         return type(self)(self.base_dist.expand(torch.Size(batch_shape)), self.bijector)
 
     def rsample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
-        """Return reparametrised actions ``(*sample, *batch, d)`` and their log-densities."""
+        """Return reparametrized actions ``(*sample, *batch, d)`` and their log-densities."""
         latent, latent_log_prob = _rsample_and_log_prob(self.base_dist, torch.Size(sample_shape))
         action, log_det = self._forward_and_scored_log_det(_checked(latent))
         return _in_dtype_of(latent, action), latent_log_prob - log_det
@@ -74,7 +74,7 @@ class ConstrainedFlow(TransformedDistribution):
         return _in_dtype_of(latent, action), _log_prob(self.base_dist, latent) - log_det
 
     def rsample(self, sample_shape: Shape = ()) -> Tensor:
-        """Return reparametrised actions ``(*sample, *batch, d)``."""
+        """Return reparametrized actions ``(*sample, *batch, d)``."""
         return self._pushed(self.base_dist.rsample(torch.Size(sample_shape)))
 
     def sample(self, sample_shape: Shape = ()) -> Tensor:

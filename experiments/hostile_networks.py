@@ -39,7 +39,7 @@ from cnfp_torchrl.training.agent import build_actor, build_environment
 
 RESULT = Path(__file__).parent / "results" / "hostile_networks.json"
 SAFE_FLOWS = ("exact", "gauge", "radial", "projection")
-FLOWS = (*SAFE_FLOWS, "squash", "none")
+FLOWS = (*SAFE_FLOWS, "squash", "unconstrained")
 HUGE = 1e6
 
 Mean = Callable[[Tensor], Tensor]
@@ -140,7 +140,7 @@ class Row:
         steps: environment steps.
         violations: by constraint, as the environment counts them.
         drops: states in which a constraint was inactive, by constraint.
-        minimum_centre_slack: over all states, in action units.
+        minimum_anchor_slack: over all states, in action units.
         seconds: how long it took.
     """
 
@@ -149,7 +149,7 @@ class Row:
     steps: int
     violations: dict[str, int]
     drops: dict[str, int]
-    minimum_centre_slack: float
+    minimum_anchor_slack: float
     seconds: float
 
 
@@ -161,7 +161,7 @@ def run(
     started = time.perf_counter()
     torch.manual_seed(seed)
     config = default_config(flow)
-    env = build_environment(config, batch_size=[agents], with_centre=True)
+    env = build_environment(config, batch_size=[agents], with_anchor=True)
     env.set_seed(seed)
     actor, new_episode = build(config, env, hostile)
     head = flow_head(actor)
@@ -172,7 +172,7 @@ def run(
         while taken < steps:
             transition, state = env.step_and_maybe_reset(actor(state))
             region = head.get_region(transition)
-            least = min(least, float(region.slack(region.centre).min()))
+            least = min(least, float(region.slack(region.anchor).min()))
             for bijector in head.bijectors:
                 drops[bijector.name] += int((~transition.get(bijector.active_key)).sum())
             costs += transition.get(("next", "cost")).sum(0)
@@ -219,13 +219,13 @@ def as_markdown(result: dict[str, Any]) -> str:
     names = list(result["rows"][0]["violations"])
     columns = ["flow", "network: latent mean and scale", "steps"]
     columns += [f"violations: {name}" for name in names]
-    columns += ["constraints dropped", "least slack of the centre"]
+    columns += ["constraints dropped", "least slack of the anchor"]
     lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
     for row in result["rows"]:
         counts = [f"{row['violations'][name]:,}" for name in names]
         dropped = f"{sum(row['drops'].values()):,}"
         cells = [row["flow"], row["network"], f"{row['steps']:,}", *counts, dropped]
-        lines.append(" | ".join([*cells, f"{row['minimum_centre_slack']:.5f}"]))
+        lines.append(" | ".join([*cells, f"{row['minimum_anchor_slack']:.5f}"]))
     table = "\n".join(f"| {line} |" for line in lines)
     versions = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
     return (

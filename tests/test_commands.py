@@ -73,7 +73,7 @@ def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
         json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")
     ]
     jobs = {(summary["seed"], summary["flow"]) for summary in summaries}
-    assert jobs == {(seed, flow) for seed in (0, 1) for flow in ("ExactFlow", "PaperChain")}
+    assert jobs == {(seed, flow) for seed in (0, 1) for flow in ("ExactFlow", "SquashFlow")}
 
 
 @pytest.mark.parametrize(

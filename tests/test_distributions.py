@@ -46,10 +46,10 @@ def in_the_plane(case: Case) -> object:
 
 @pytest.mark.parametrize("case", [in_the_plane(case) for case in PLANE])
 def test_density_integrates_to_one_in_the_plane(case: Case) -> None:
-    """By the midpoint rule on a grid that is finer towards the centre, where the density varies.
+    """By the midpoint rule on a grid that is finer towards the anchor, where the density varies.
 
     A grid twice as fine has about a third of the error, which is measured to be half of what is
-    allowed here. A chain's image is narrow in its last set, and a centre 1e-4 from a boundary needs
+    allowed here. A chain's image is narrow in its last set, and an anchor 1e-4 from a boundary needs
     a much finer grid there: those get less far.
     """
     count, power, close = 160, 2, 2e-3
@@ -58,11 +58,11 @@ def test_density_integrates_to_one_in_the_plane(case: Case) -> None:
     if "tight" in case.name:
         count, power, close = 240, 6, 3e-2
     box = case.sets[-1 if case.kind == "chain" else 0].bounding_box()
-    centre = (box.low + box.high) / 2 if case.centre is None else case.centre
+    anchor = (box.low + box.high) / 2 if case.anchor is None else case.anchor
     middles = (2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1
     grid = torch.cartesian_prod(middles, middles).reshape(-1, *[1] * len(case.batch_shape), 2)
-    reach = torch.where(grid > 0, box.high - centre, centre - box.low)
-    action = centre + grid.sign() * grid.abs() ** power * reach
+    reach = torch.where(grid > 0, box.high - anchor, anchor - box.low)
+    action = anchor + grid.sign() * grid.abs() ** power * reach
     area = (2 * reach * power * grid.abs() ** (power - 1) / count).prod(-1)
     density = flow(case, torch.float64, 0.5).log_prob(action.expand(-1, *case.batch_shape, 2)).exp()
     assert ((density * area).sum(0) - 1).abs().max() < close
@@ -70,16 +70,16 @@ def test_density_integrates_to_one_in_the_plane(case: Case) -> None:
 
 @pytest.mark.parametrize("case", LINE, **ids)
 def test_density_integrates_to_one_on_the_line(case: Case) -> None:
-    """By Gauss's rule, on both sides of the centre, where the density may jump."""
+    """By Gauss's rule, on both sides of the anchor, where the density may jump."""
     boxes = [each.bounding_box() for each in case.sets]
     low = torch.stack([box.low for box in boxes]).amax(0)
     high = torch.stack([box.high for box in boxes]).amin(0)
-    centre = (low + high) / 2 if case.centre is None else case.centre
+    anchor = (low + high) / 2 if case.anchor is None else case.anchor
     nodes, weights = map(torch.from_numpy, leggauss(200))
     distribution, total = flow(case, torch.float64), 0.0
     for end in (low, high):
-        action = centre + (nodes.unsqueeze(-1) + 1) / 2 * (end - centre)
-        total += (distribution.log_prob(action).exp() * weights).sum() / 2 * (end - centre).abs()
+        action = anchor + (nodes.unsqueeze(-1) + 1) / 2 * (end - anchor)
+        total += (distribution.log_prob(action).exp() * weights).sum() / 2 * (end - anchor).abs()
     assert float(total) == pytest.approx(1, abs=1e-9)
 
 
@@ -137,7 +137,7 @@ def test_log_prob_outside_is_minus_infinity(case: Case) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_log_prob_is_never_nan_on_the_boundary(case: Case, dtype: torch.dtype) -> None:
-    """Of saturated samples, and of their neighbours on either side of the boundary."""
+    """Of saturated samples, and of their neighbors on either side of the boundary."""
     distribution = flow(case, dtype)
     z = torch.cat([latents(case, 50, dtype, length) for length in (5.0, 8.0, 12.0, 20.0, 1e6)])
     action = distribution.bijector(z)
@@ -261,8 +261,8 @@ def test_reference_flow_leaves_out_the_retractions() -> None:
         torch.testing.assert_close(same, action, rtol=0, atol=0)
         torch.manual_seed(0)
         bounded = true.stages(true.base_dist.sample((50,))).actions[0]
-        assert case.centre is not None
-        share = (action - case.centre).norm(dim=-1) / (bounded - case.centre).norm(dim=-1)
+        assert case.anchor is not None
+        share = (action - case.anchor).norm(dim=-1) / (bounded - case.anchor).norm(dim=-1)
         torch.testing.assert_close(reference_log_prob - log_prob, case.dim * share.log())
         assert (share < 0.9).any()
     torch.testing.assert_close(entropic.log_prob(action), true.log_prob(action), rtol=0, atol=0)
@@ -309,7 +309,7 @@ def test_scores_keep_the_gradients_that_losses_need() -> None:
     assert not distribution.sample().requires_grad
 
 
-class WithoutReparametrisation(Independent):
+class WithoutReparametrization(Independent):
     """A base whose samples have no gradients."""
 
     has_rsample = False
@@ -318,9 +318,9 @@ class WithoutReparametrisation(Independent):
         raise NotImplementedError
 
 
-def test_base_need_not_be_reparametrised() -> None:
+def test_base_need_not_be_reparametrized() -> None:
     case = BY_NAME["gauge-ball-d2"]
-    base = WithoutReparametrisation(Normal(torch.zeros(2), torch.ones(2)), 1)
+    base = WithoutReparametrization(Normal(torch.zeros(2), torch.ones(2)), 1)
     distribution = ConstrainedFlow(base, case.build(torch.float32))
     assert not distribution.has_rsample
     action, log_prob = distribution.sample_and_log_prob((3,))

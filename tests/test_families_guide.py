@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import torch
 
-from cnfp_torchrl.envs import GeometryTransform, PointNavEnv, constrain_env
+from cnfp_torchrl.envs import GeometryTransform, constrain_env
 from cnfp_torchrl.geometry import HalfSpaces
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.testing import FamilyError, check_constraint_set
 
 GUIDE = (Path(__file__).resolve().parents[1] / "docs" / "families.md").read_text()

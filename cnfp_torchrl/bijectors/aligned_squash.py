@@ -8,11 +8,11 @@ from cnfp_torchrl.bijectors.region_squash import RegionSquash
 from cnfp_torchrl.geometry import Box, ConstraintSet
 
 
-class AlignedSquash(RegionSquash):
+class ExactSquash(RegionSquash):
     r"""Squash R^d exactly onto the intersection of all active sets of a region.
 
     Stage 0 is the box squash into the action bounds B, :math:`x = \mathrm{BoxSquash}(z)`. Let c be
-    the centre, :math:`v = x - c`, and :math:`B_k` the intersection of B with the boxes among the
+    the anchor, :math:`v = x - c`, and :math:`B_k` the intersection of B with the boxes among the
     first k constraints. What boxes forbid is taken out in each component on its own,
 
     .. math:: w_i = v_i\, \rho_i, \quad \rho_i = room_i(B_k) / room_i(B),
@@ -25,7 +25,7 @@ class AlignedSquash(RegionSquash):
     A box beside the agent thus leaves the motion along it alone, which a retraction of the whole
     vector (`GaugeSquash`) shortens with the motion towards it. Without boxes among the constraints
     both are the same. The log-density jumps where a component of v changes its sign, and where
-    other sets bind it has no limit at the centre (`docs/method.md`). See `RegionSquash` for the
+    other sets bind it has no limit at the anchor (`docs/method.md`). See `RegionSquash` for the
     arguments.
     """
 

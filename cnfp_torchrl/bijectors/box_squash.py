@@ -58,11 +58,11 @@ class BoxSquash(Bijector):
         self._half = (image.high - image.low) / 2
         self._log_slope_scale = (4 * self._half).log()
 
-    def about(self, centre: Tensor) -> Self:
+    def about(self, anchor: Tensor) -> Self:
         """Return the squash in coordinates about a point ``(*batch, d)``: actions minus it."""
         squash = type(self).__new__(type(self))
         Bijector.__init__(squash)
-        squash._middle = self._middle - centre
+        squash._middle = self._middle - anchor
         squash._half, squash._log_slope_scale = self._half, self._log_slope_scale
         return squash
 

@@ -11,12 +11,12 @@ from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero
 from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
-class BijectorChain(Bijector):
+class SquashChain(Bijector):
     r"""Apply bijectors in order, :math:`a = f_1(f_2(\dots f_K(z)))` with :math:`f_K` listed first.
 
     The log-determinants add up (paper, eq. normalizing_flow). A chain of squashes is the paper's
     policy: **only the last bijector's set is guaranteed**, because each one moves what those before
-    it placed. `AlignedSquash` is the exact alternative.
+    it placed. `ExactSquash` is the exact alternative.
 
     Args:
         bijectors: in order of application, the last has the highest priority.

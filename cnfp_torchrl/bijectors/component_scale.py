@@ -1,4 +1,4 @@
-"""Scaling of offsets component by component, by one factor on each side of the centre."""
+"""Scaling of offsets component by component, by one factor on each side of the anchor."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def paper_squash(constraint_set: ConstraintSet) -> Bijector:
     """Return the paper's analytic squash of R^d onto one set, without checking its fields.
 
     Raises:
-        TypeError: when the family has none; `AlignedSquash` handles every family.
+        TypeError: when the family has none; `ExactSquash` handles every family.
     """
     # A plain look-up, because torch.compile cannot trace functools.singledispatch.
     squash = PAPER_SQUASHES.get(type(constraint_set))

@@ -21,7 +21,7 @@ class Projection(Bijector):
     r"""Squash R^d into the action bounds, then take the closest point of the region.
 
     :math:`a = \arg\min_{a' \in S} |a' - \mathrm{BoxSquash}(z)|`, found by Dykstra's algorithm
-    (`cnfp_torchrl.geometry.project_onto_intersection`), then drawn towards the centre as far as the
+    (`cnfp_torchrl.geometry.project_onto_intersection`), then drawn towards the anchor as far as the
     rounds of the algorithm did not suffice, so that every action satisfies every active constraint
     with zero tolerance. Differentiable almost everywhere.
 
@@ -31,7 +31,7 @@ class Projection(Bijector):
     before the projection.
 
     Args:
-        region: sets with closed-form projections, centre and active flags, ``(*batch,)`` of them.
+        region: sets with closed-form projections, anchor and active flags, ``(*batch,)`` of them.
         rounds: of Dykstra's algorithm, >= 1.
         validate_args: check the action bounds, which reads them on the host.
 
@@ -78,14 +78,14 @@ class Projection(Bijector):
         return self.forward_and_reference_log_det(x)[0]
 
     def _drawn_in(self, action: Tensor) -> Tensor:
-        centre = self._region.centre
-        offset = action - centre
+        anchor = self._region.anchor
+        offset = action - anchor
         direction, zero = scaled_direction(offset)
         length = offset.detach().abs().amax(-1)
         # The gauge of the offset itself; above 1 where it ends outside.
         gauge = self._region.gauges(direction)[-1] * length
         share = torch.where(zero, 1.0, 1 / gauge.clamp(min=1))
-        return centre + share.unsqueeze(-1) * offset
+        return anchor + share.unsqueeze(-1) * offset
 
 
 def _no_density(wanted: str) -> NoDensityError:

@@ -14,7 +14,7 @@ from cnfp_torchrl.geometry import Region
 
 
 class RadialSquash(Bijector):
-    r"""Squash R^d onto a region along rays from its centre, :math:`a = c + \tanh(\rho)\, u/g(u)`.
+    r"""Squash R^d onto a region along rays from its anchor, :math:`a = c + \tanh(\rho)\, u/g(u)`.
 
     With :math:`\rho = |z|`, :math:`u = z/\rho` and g the region's gauge,
     :math:`\log|\det| = -d \log g(u) + L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)`: the squash into
@@ -23,7 +23,7 @@ class RadialSquash(Bijector):
     samples land on the boundary (`docs/method.md`, section 2).
 
     Args:
-        region: sets, centre and active flags, ``(*batch,)`` of them.
+        region: sets, anchor and active flags, ``(*batch,)`` of them.
     """
 
     def __init__(self, region: Region) -> None:
@@ -46,7 +46,7 @@ class RadialSquash(Bijector):
         return action, log_det + latent.shape[-1] * (inner / outer).log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        offset = action - self.region.centre
+        offset = action - self.region.anchor
         direction, _ = scaled_direction(offset)
         _, gauge = self.region.outer_and_inner_gauge(direction)
         length = vector_norm(direction, dim=-1)
@@ -56,7 +56,7 @@ class RadialSquash(Bijector):
         return latent, action.shape[-1] * (gauge / length).log() - log_det
 
     def contains(self, action: Tensor) -> Tensor:
-        offset = action - self.region.centre
+        offset = action - self.region.anchor
         direction, zero = scaled_direction(offset)
         _, gauge = self.region.outer_and_inner_gauge(direction)
         return (offset.abs().amax(-1) * gauge < 1) | zero
@@ -68,5 +68,5 @@ class RadialSquash(Bijector):
     def _stretch(self, latent: Tensor, direction: Tensor, gauge: Tensor) -> tuple[Tensor, Tensor]:
         point, log_det = squash_to_unit_ball(latent)
         width = vector_norm(direction, dim=-1) / gauge
-        action = self.region.centre + width.unsqueeze(-1) * point
+        action = self.region.anchor + width.unsqueeze(-1) * point
         return action, log_det + latent.shape[-1] * width.log()

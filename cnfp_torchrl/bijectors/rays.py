@@ -1,4 +1,4 @@
-"""Arithmetic along the rays from a centre, shared by the radial bijectors."""
+"""Arithmetic along the rays from an anchor, shared by the radial bijectors."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ def region_shape(region: Region) -> torch.Size:
     """Return the shape ``(*batch, d)`` of a region's actions."""
     active = () if region.active is None else (region.active.shape[:-1],)
     sets = (each.batch_shape for each in region.sets)
-    batch = broadcast_shape(region.centre.shape[:-1], *active, *sets)
-    return torch.Size((*batch, region.centre.shape[-1]))
+    batch = broadcast_shape(region.anchor.shape[:-1], *active, *sets)
+    return torch.Size((*batch, region.anchor.shape[-1]))
 
 
 class Rays:
-    """The rays from a centre through points of an outer set.
+    """The rays from an anchor through points of an outer set.
 
     Args:
-        offset: points minus the centre, ``(*batch, d)``.
+        offset: points minus the anchor, ``(*batch, d)``.
         progress: the share of the way to the outer boundary at which each point lies, the outer
             set's gauge of its offset, ``(*batch,)``.
     """
@@ -75,7 +75,7 @@ class Rays:
         constraint must not pass for one that does not bind.
 
         Args:
-            inner: the gauges of one or more inner sets about the centre.
+            inner: the gauges of one or more inner sets about the anchor.
         """
         gauges = [gauge(self._direction) for gauge in inner]
         if len(gauges) == 1:

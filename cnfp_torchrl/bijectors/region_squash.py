@@ -20,11 +20,11 @@ class RegionSquash(Bijector):
     """Squash R^d exactly onto the intersection of all active sets of a region.
 
     A subclass says which of the sets are retracted component by component; the others are retracted
-    along rays from the centre. The image is the region eroded by rounding error: saturated samples
+    along rays from the anchor. The image is the region eroded by rounding error: saturated samples
     satisfy every active constraint with zero tolerance.
 
     Args:
-        region: sets, centre and active flags, ``(*batch,)`` of them.
+        region: sets, anchor and active flags, ``(*batch,)`` of them.
         validate_args: check the action bounds, which reads them on the host.
 
     Raises:
@@ -36,12 +36,12 @@ class RegionSquash(Bijector):
         if validate_args:
             region.bounds.validate()
         self.region = region.eroded()
-        # All stages work in coordinates about the centre, where the box squash and the gauges have
+        # All stages work in coordinates about the anchor, where the box squash and the gauges have
         # the same bounds in floating point. Were they a rounding error of the coordinates apart, a
         # gauge of 1 + e at the bounds would let samples overshoot by e times the distance to the
-        # centre, and near a bound one rounding error is a large e.
+        # anchor, and near a bound one rounding error is a large e.
         self._box = BoxSquash.onto(self.region.bounds, validate_args=validate_args).about(
-            region.centre
+            region.anchor
         )
         self._retraction = self._retraction_into(self.region.sets[1:])
 
@@ -87,26 +87,26 @@ class RegionSquash(Bijector):
 
     def _retraction_into(self, sets: Sequence[ConstraintSet]) -> _Retraction:
         boxes, others = self.boxes_and_others(sets)
-        return _Retraction(self._box.image, boxes, others, self.region.centre)
+        return _Retraction(self._box.image, boxes, others, self.region.anchor)
 
 
 class _Retraction:
     """The bijection from offsets within the action bounds onto actions within further sets."""
 
     def __init__(
-        self, bounds: Box, boxes: Sequence[Box], others: Sequence[ConstraintSet], centre: Tensor
+        self, bounds: Box, boxes: Sequence[Box], others: Sequence[ConstraintSet], anchor: Tensor
     ) -> None:
-        self._centre = centre
+        self._anchor = anchor
         self._above, self._below = bounds.high.reciprocal(), -bounds.low.reciprocal()
         self._scale = None
         if boxes:
             inner = bounds
             for box in boxes:
-                low = torch.maximum(inner.low, box.low - centre)
-                high = torch.minimum(inner.high, box.high - centre)
+                low = torch.maximum(inner.low, box.low - anchor)
+                high = torch.minimum(inner.high, box.high - anchor)
                 inner = Box(low, high, validate_args=False)
             self._scale = ComponentScale.between(bounds, inner)
-        self._inner = [each.gauge_about(centre) for each in others]
+        self._inner = [each.gauge_about(anchor) for each in others]
 
     def forward(self, offset: Tensor) -> Tensor:
         scaled, contraction = self._scaled_and_contraction(offset)
@@ -142,7 +142,7 @@ class _Retraction:
         return offset, log_det
 
     def _offset_and_contraction(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        offset = action - self._centre
+        offset = action - self._anchor
         if self._scale is not None:
             offset = self._scale.inverse(offset)
         # It depends on the direction alone, as the component scale does.
@@ -162,6 +162,6 @@ class _Retraction:
 
     def _contracted(self, scaled: Tensor, contraction: Tensor | None) -> Tensor:
         if contraction is None:
-            return self._centre + scaled
+            return self._anchor + scaled
         # Not a quotient: its gradient takes more passes.
-        return torch.addcmul(self._centre, scaled, contraction.reciprocal().unsqueeze(-1))
+        return torch.addcmul(self._anchor, scaled, contraction.reciprocal().unsqueeze(-1))

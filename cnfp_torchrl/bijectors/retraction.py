@@ -12,7 +12,7 @@ from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 
 class Retraction(Bijector):
-    r"""Retract a set radially onto its intersection with another one, about a common centre.
+    r"""Retract a set radially onto its intersection with another one, about a common anchor.
 
     With :math:`v = x - c`: :math:`a = c + v/r`, :math:`r = \max(1, g_{inner}(v)/g_{outer}(v))`,
     :math:`\log|\det| = -d \log r`.
@@ -22,37 +22,37 @@ class Retraction(Bijector):
             a squash onto it leaves its margin already, and an argument beyond it by a rounding
             error would leave the inner set by that error's share of the distance to the boundary.
         inner: the set to retract into.
-        centre: a point strictly inside both, ``(*batch, d)``.
+        anchor: a point strictly inside both, ``(*batch, d)``.
     """
 
-    def __init__(self, outer: ConstraintSet, inner: ConstraintSet, centre: Tensor) -> None:
+    def __init__(self, outer: ConstraintSet, inner: ConstraintSet, anchor: Tensor) -> None:
         super().__init__()
         inner = inner.eroded(outer.bounding_box().magnitude())
-        self._outer, self._inner, self._centre = outer, inner, centre
-        self._outer_gauge = outer.gauge_about(centre)
-        self._inner_gauge = inner.gauge_about(centre)
+        self._outer, self._inner, self._anchor = outer, inner, anchor
+        self._outer_gauge = outer.gauge_about(anchor)
+        self._inner_gauge = inner.gauge_about(anchor)
 
     @property
     def shape(self) -> torch.Size:
         batch = broadcast_shape(
-            self._centre.shape[:-1], self._outer.batch_shape, self._inner.batch_shape
+            self._anchor.shape[:-1], self._outer.batch_shape, self._inner.batch_shape
         )
-        return torch.Size((*batch, self._centre.shape[-1]))
+        return torch.Size((*batch, self._anchor.shape[-1]))
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        offset = latent - self._centre
+        offset = latent - self._anchor
         contraction = self._contraction(offset)
-        action = self._centre + offset / contraction.unsqueeze(-1)
+        action = self._anchor + offset / contraction.unsqueeze(-1)
         return action, -latent.shape[-1] * contraction.log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        offset = action - self._centre
+        offset = action - self._anchor
         contraction = self._contraction(offset)
-        latent = self._centre + offset * contraction.unsqueeze(-1)
+        latent = self._anchor + offset * contraction.unsqueeze(-1)
         return latent, action.shape[-1] * contraction.log()
 
     def contains(self, action: Tensor) -> Tensor:
-        offset = action - self._centre
+        offset = action - self._anchor
         return self._outer_gauge(offset) * self._contraction(offset) < 1
 
     def _contraction(self, offset: Tensor) -> Tensor:

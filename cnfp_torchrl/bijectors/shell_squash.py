@@ -19,7 +19,7 @@ class ShellSquash(Bijector):
 
     :math:`a = m + \phi(\rho)\, z/\rho` with :math:`\rho = |z|` and :math:`\phi(\rho) = r_{in} +
     (r_{out} - r_{in}) \tanh \rho`, so :math:`\log|\det| = (d - 1) \log(\phi/\rho) + \log
-    \phi'(\rho)`. With a region about the same centre, :math:`r_{out}(u) = \min(outer, 1/g(u))`
+    \phi'(\rho)`. With a region about the same anchor, :math:`r_{out}(u) = \min(outer, 1/g(u))`
     along each ray: the part of the region outside the inner ball.
 
     A shell is not convex, and not star-shaped about any point: this is a bijector of its own, not a
@@ -30,7 +30,7 @@ class ShellSquash(Bijector):
         center: m, ``(*batch, d)``.
         inner: radius of the hole, ``(*batch,)``.
         outer: outer radius, ``(*batch,)``.
-        region: further sets that actions must satisfy, with centre m; it must reach beyond the hole
+        region: further sets that actions must satisfy, with center m; it must reach beyond the hole
             along every ray. A ray on which it does not gives NaN, which environments refuse.
         validate_args: check the arguments, which reads them on the host.
 

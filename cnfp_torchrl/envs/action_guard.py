@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.centre import ConstraintCentre, constraint_bijectors
+from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor, constraint_bijectors
 from cnfp_torchrl.envs.geometry_transform import appended_transforms
-from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY, require
+from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY, require
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.guard import refuse_violations
 
@@ -33,7 +33,7 @@ class ActionGuard(Transform):
     `torchrl.envs.check_env_specs` acts at random: call it before.
 
     Raises:
-        ValueError: when the environment publishes no constraint or no centre, or changes actions
+        ValueError: when the environment publishes no constraint or no anchor, or changes actions
             between its constraints and the guard.
         ConstraintViolationError: at a step, naming constraint, batch index, action and slack.
     """
@@ -48,9 +48,9 @@ class ActionGuard(Transform):
         action = require(tensordict, head.action_key, "call a policy before the step").detach()
         stepped = tensordict.get("_step", None)
         if stepped is not None:
-            # What is not executed needs no check; the centre passes it.
+            # What is not executed needs no check; the anchor passes it.
             mask = stepped.reshape(*tensordict.batch_size, 1)
-            action = torch.where(mask, action, tensordict.get(CENTRE_KEY).to(action.dtype))
+            action = torch.where(mask, action, tensordict.get(ANCHOR_KEY).to(action.dtype))
         refuse_violations(head.order, head.get_region(tensordict), action)
         return tensordict
 
@@ -72,7 +72,7 @@ class ActionGuard(Transform):
 
     def _refuse_changed_actions(self) -> None:
         transforms = appended_transforms(self.parent)
-        for each in dropwhile(lambda each: not isinstance(each, ConstraintCentre), transforms):
+        for each in dropwhile(lambda each: not isinstance(each, ConstraintAnchor), transforms):
             if self.parent.action_key in each.in_keys_inv:
                 raise ValueError(
                     "ActionGuard: expected to be appended before transforms that change actions, "

@@ -19,9 +19,9 @@ CONSTRAINTS_KEY = "constraints"
 """Where geometry stands in the tensordict: ``("constraints", NAME, FIELD)``."""
 
 SAFE_ACTION_KEY = (CONSTRAINTS_KEY, "safe_action")
-"""A candidate for the centre: an action that a geometry believes to be safe, ``(*batch, d)``."""
+"""A candidate for the anchor: an action that a geometry believes to be safe, ``(*batch, d)``."""
 
-_RESERVED_NAMES = ("centre", "safe_action")
+_RESERVED_NAMES = ("anchor", "safe_action")
 
 
 class GeometryTransform(Transform, ABC):
@@ -86,7 +86,7 @@ class GeometryTransform(Transform, ABC):
     def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor | None:
         """Return an action believed to keep all constraints, ``(*batch, d)``, or None.
 
-        It is a candidate for the centre of the allowed actions and will be checked.
+        It is a candidate for the anchor of the allowed actions and will be checked.
 
         Args:
             tensordict: a state of any batch size; not to be changed.

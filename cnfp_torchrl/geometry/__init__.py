@@ -1,8 +1,8 @@
-"""Sets of allowed actions and their intersections: containment, slack, gauges, centres."""
+"""Sets of allowed actions and their intersections: containment, slack, gauges, anchors."""
 
+from cnfp_torchrl.geometry.anchors import MINIMUM_SLACK, chebyshev_center, lexicographic_anchor
 from cnfp_torchrl.geometry.ball import Ball
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.centres import MINIMUM_SLACK, chebyshev_centre, lexicographic_centre
 from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, GeometryError
 from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
@@ -34,8 +34,8 @@ __all__ = [
     "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
-    "chebyshev_centre",
-    "lexicographic_centre",
+    "chebyshev_center",
+    "lexicographic_anchor",
     "project",
     "project_onto_intersection",
 ]

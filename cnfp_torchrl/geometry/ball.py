@@ -17,7 +17,7 @@ from cnfp_torchrl.geometry.superlevel import Cone
 
 
 def ball_gauge_about(offset: Tensor, radius: Tensor) -> Gauge:
-    r"""Return the gauge of a ball about a point at an offset from the ball's centre.
+    r"""Return the gauge of a ball about a point at an offset from the ball's center.
 
     With :math:`k = (r - |w|)(r + |w|)`, :math:`\beta = v \cdot w/k` and :math:`q = |v|^2/k`:
     :math:`g = \beta + \sqrt{\beta^2 + q}`, which cancels for :math:`\beta < 0`. With
@@ -26,7 +26,7 @@ def ball_gauge_about(offset: Tensor, radius: Tensor) -> Gauge:
     never does.
 
     Args:
-        offset: w, the point minus the ball's centre, ``(*batch, d)``, shorter than the radius.
+        offset: w, the point minus the ball's center, ``(*batch, d)``, shorter than the radius.
         radius: r, ``(*batch,)``.
     """
     distance = vector_norm(offset, dim=-1)
@@ -56,7 +56,7 @@ class Ball(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 0}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
         yield "center", self.center.isinf(), "a finite center"
 
@@ -67,11 +67,11 @@ class Ball(ConstraintSet):
     def slack(self, action: Tensor) -> Tensor:
         return self.radius - vector_norm(action - self.center, dim=-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        return ball_gauge_about(centre - self.center, self.radius)
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        return ball_gauge_about(anchor - self.center, self.radius)
 
     def bounding_box(self) -> Box:
         radius = self.radius.unsqueeze(-1)
@@ -82,17 +82,17 @@ class Ball(ConstraintSet):
         size = self.radius + vector_norm(self.center, dim=-1)
         return type(self)(self.center, torch.sub(self.radius, size, alpha=eps), validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        return type(self)(centre, radius.expand(centre.shape[:-1]), validate_args=False)
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        return type(self)(center, radius.expand(center.shape[:-1]), validate_args=False)
 
     def superlevel(self) -> Cone:
         identity = torch.eye(self.dim, dtype=self.dtype, device=self.center.device)
         return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
 
-    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
-        # The radius alone, because torch.where is slow where the mask broadcasts. A far centre's
+    def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
+        # The radius alone, because torch.where is slow where the mask broadcasts. A far center's
         # distance is known up to rounding error, which may be larger than what is to be added.
-        distance = vector_norm(centre - self.center, dim=-1)
+        distance = vector_norm(center - self.center, dim=-1)
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         beyond = torch.add(distance, distance, alpha=eps) + radius
         return type(self)(
@@ -102,8 +102,8 @@ class Ball(ConstraintSet):
     def inner_ball(self, radius: float) -> Self:
         r"""Return the ball of at most the given radius inside this one that is nearest to 0.
 
-        Its centre is :math:`m \max(0, 1 - (r - \rho)/|m|)` with :math:`\rho = \min(r, radius)`: 0
-        when this ball has room for it there, and on the way to this ball's centre m otherwise.
+        Its anchor is :math:`m \max(0, 1 - (r - \rho)/|m|)` with :math:`\rho = \min(r, radius)`: 0
+        when this ball has room for it there, and on the way to this ball's center m otherwise.
         """
         inner = self.radius.clamp(max=radius)
         distance = vector_norm(self.center, dim=-1)

@@ -1,6 +1,6 @@
 """A batched interior-point method for the largest smallest slack of several convex sets.
 
-Path-following with the logarithmic barrier: for growing eta, Newton's method minimises
+Path-following with the logarithmic barrier: for growing eta, Newton's method minimizes
 ``-eta t + barrier(a, t)``. Every iterate is strictly feasible, so its slack is a lower bound of the
 best one; a small Newton decrement certifies an upper bound (Nesterov, Introductory Lectures on
 Convex Optimization, 2004, theorem 4.2.7).
@@ -33,7 +33,7 @@ class Best(NamedTuple):
     upper_bound: Tensor
 
 
-def maximise_slack(
+def maximize_slack(
     problem: Program, start: Tensor, scale: Tensor, enough: float, share: float
 ) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.

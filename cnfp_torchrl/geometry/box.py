@@ -28,7 +28,7 @@ class Box(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"low": 1, "high": 1}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "low", self.low >= self.high, "low < high"
 
     def contains(self, action: Tensor) -> Tensor:
@@ -37,11 +37,11 @@ class Box(ConstraintSet):
     def slack(self, action: Tensor) -> Tensor:
         return torch.minimum(self.high - action, action - self.low).amin(-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        above, below = self.high - centre, centre - self.low
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        above, below = self.high - anchor, anchor - self.low
         return partial(_gauge, above.reciprocal(), below.reciprocal())
 
     def bounding_box(self) -> Box:
@@ -58,17 +58,17 @@ class Box(ConstraintSet):
         low, high = torch.add(self.low, size, alpha=eps), torch.sub(self.high, size, alpha=eps)
         return type(self)(low, high, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         half = radius.unsqueeze(-1)
-        return type(self)(centre - half, centre + half, validate_args=False)
+        return type(self)(center - half, center + half, validate_args=False)
 
-    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
+    def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
         # Arithmetic, because torch.where is slow where the mask broadcasts. Where the set is active
-        # the shift is so large that the bounds stay, wherever the centre is.
+        # the shift is so large that the bounds stay, wherever the center is.
         shift = active.to(self.dtype) * (torch.finfo(self.dtype).max / 2) - radius
         shift = shift.unsqueeze(-1)
-        low = torch.minimum(self.low, centre + shift)
-        high = torch.maximum(self.high, centre - shift)
+        low = torch.minimum(self.low, center + shift)
+        high = torch.maximum(self.high, center - shift)
         return type(self)(low, high, validate_args=False)
 
     def superlevel(self) -> Rows:
@@ -86,10 +86,10 @@ def sides(offset: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def gauge_of_sides(above: Tensor, below: Tensor, ahead: Tensor, behind: Tensor) -> Tensor:
-    """Return the gauge of a box, ``(*batch,)``, at an offset from a centre given by its `sides`.
+    """Return the gauge of a box, ``(*batch,)``, at an offset from an anchor given by its `sides`.
 
     Args:
-        above: inverse distances from the centre to the high bounds, ``(*batch, d)``.
+        above: inverse distances from the anchor to the high bounds, ``(*batch, d)``.
         below: inverse distances to the low bounds, ``(*batch, d)``.
         ahead: of the offset, ``(*batch, d)``.
         behind: of the offset, ``(*batch, d)``.

@@ -22,7 +22,7 @@ EROSION_IN_EPS = 16.0
 """How many units of rounding error `ConstraintSet.eroded` moves a boundary inwards."""
 
 Gauge: TypeAlias = Callable[[Tensor], Tensor]
-"""The gauge of a set about a centre: directions ``(*batch, d)`` to values ``(*batch,)``."""
+"""The gauge of a set about an anchor: directions ``(*batch, d)`` to values ``(*batch,)``."""
 
 
 class GeometryError(ValueError):
@@ -45,9 +45,9 @@ class ConstraintSet(ABC):
     and, where there is more to say than the defaults do,
 
     - `gauge_about`: the gauge with all that does not depend on the direction computed once,
-    - `violations`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
+    - `invalid_fields`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
-    - `superlevel`: what the search for centres needs to be fast, `part_near` if not convex.
+    - `superlevel`: what the search for anchors needs to be fast, `part_near` if not convex.
 
     Constructing a set checks it, which reads tensors on the host. Hot paths, whose values were
     checked where they entered, construct with ``validate_args=False``.
@@ -73,14 +73,14 @@ class ConstraintSet(ABC):
         """
 
     @abstractmethod
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        r"""Return the gauge about a centre, :math:`g(v) = \inf\{t > 0 : c + v/t \in C\}`.
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        r"""Return the gauge about an anchor, :math:`g(v) = \inf\{t > 0 : c + v/t \in C\}`.
 
-        The boundary lies at ``centre + direction / gauge``; 0 where the set has no end that way.
+        The boundary lies at ``anchor + direction / gauge``; 0 where the set has no end that way.
 
         Args:
             direction: ``(*batch, d)``, not zero.
-            centre: ``(*batch, d)``, strictly inside the set; elsewhere the result is meaningless.
+            anchor: ``(*batch, d)``, strictly inside the set; elsewhere the result is meaningless.
         """
 
     @abstractmethod
@@ -92,25 +92,25 @@ class ConstraintSet(ABC):
         """
 
     @abstractmethod
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         """Return a set of this family that contains a ball, with fields shaped as here.
 
         It takes a dropped set's place: it reaches beyond the action bounds, so that it never binds.
 
         Args:
-            centre: of the ball, ``(*batch, d)``.
+            center: of the ball, ``(*batch, d)``.
             radius: of the ball, ``(*batch,)``, positive.
         """
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        """Return the gauge about a centre, for many directions: what they share is computed once.
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        """Return the gauge about an anchor, for many directions: what they share is computed once.
 
         Args:
-            centre: ``(*batch, d)``, strictly inside the set.
+            anchor: ``(*batch, d)``, strictly inside the set.
         """
-        return partial(_gauge_at, self, centre)
+        return partial(_gauge_at, self, anchor)
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
         yield from ()
 
@@ -131,9 +131,9 @@ class ConstraintSet(ABC):
         return Box(-high, high, validate_args=False)
 
     def superlevel(self) -> Superlevel | None:
-        """Describe the actions with a slack of at least t, for the search for centres.
+        """Describe the actions with a slack of at least t, for the search for anchors.
 
-        None, the default, makes the search linearise `slack` instead: right for any concave slack,
+        None, the default, makes the search linearize `slack` instead: right for any concave slack,
         but slower. A non-convex family describes a convex part of its set, and others by
         `part_near`.
         """
@@ -203,15 +203,15 @@ class ConstraintSet(ABC):
             validate_args=False,
         )
 
-    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
+    def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
         """Return the set where it is active, and elsewhere one of its family that contains a ball.
 
         Args:
             active: boolean ``(*batch,)``.
-            centre: of the ball, ``(*batch, d)``.
+            center: of the ball, ``(*batch, d)``.
             radius: of the ball, ``(*batch,)``.
         """
-        return self.where(active, self.around(centre, radius))
+        return self.where(active, self.around(center, radius))
 
     def validate(self, name: str | None = None) -> Self:
         """Return the set itself, or refuse it.
@@ -227,7 +227,7 @@ class ConstraintSet(ABC):
         self.validate_shapes(where)
         for field, value in self.fields().items():
             self._refuse(where, field, torch.isnan(value), "a number")
-        for field, bad, expected in self.violations():
+        for field, bad, expected in self.invalid_fields():
             self._refuse(where, field, bad, expected)
         return self
 
@@ -306,5 +306,5 @@ class ConstraintSet(ABC):
         )
 
 
-def _gauge_at(sets: ConstraintSet, centre: Tensor, direction: Tensor) -> Tensor:
-    return sets.gauge(direction, centre)
+def _gauge_at(sets: ConstraintSet, anchor: Tensor, direction: Tensor) -> Tensor:
+    return sets.gauge(direction, anchor)

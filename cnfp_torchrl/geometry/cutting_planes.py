@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.barrier import Best, is_settled, maximise_slack
+from cnfp_torchrl.geometry.barrier import Best, is_settled, maximize_slack
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 from cnfp_torchrl.geometry.slack_program import Program
 
 MAX_CUTS = 1000
-"""Linearisations of each set before the method gives up with an error."""
+"""Linearizations of each set before the method gives up with an error."""
 
 
-def maximise_slack_by_cuts(
+def maximize_slack_by_cuts(
     problem: Program,
     sets: Sequence[ConstraintSet],
     active: Tensor,
@@ -24,9 +24,9 @@ def maximise_slack_by_cuts(
     enough: float,
     share: float,
 ) -> Best:
-    r"""Do what `maximise_slack` does with further sets, of which only the slack is known.
+    r"""Do what `maximize_slack` does with further sets, of which only the slack is known.
 
-    A concave slack lies below its linearisations, :math:`slack(x) \le slack(a) + g \cdot (x - a)`:
+    A concave slack lies below its linearizations, :math:`slack(x) \le slack(a) + g \cdot (x - a)`:
     rows that are added at each point found (Kelley 1960, at points well inside the rows so far).
     Upper bounds hold for the rows, so for the sets.
 
@@ -48,8 +48,8 @@ def maximise_slack_by_cuts(
     left = torch.arange(len(start), device=start.device)
     weights = active.to(start)
     for _ in range(MAX_CUTS):
-        trial = maximise_slack(problem, start[left], scale[left], enough, (1 + share) / 2)
-        slacks, gradients = _linearised(sets, left, len(start), trial.action)
+        trial = maximize_slack(problem, start[left], scale[left], enough, (1 + share) / 2)
+        slacks, gradients = _linearized(sets, left, len(start), trial.action)
         slack = torch.where(weights > 0, slacks, torch.inf).amin(-1).minimum(trial.slack)
         better = slack > found.slack[left]
         found.action[left] = torch.where(better.unsqueeze(-1), trial.action, found.action[left])
@@ -63,12 +63,12 @@ def maximise_slack_by_cuts(
         problem = problem.with_rows(-gradients, offsets, weights).select(undecided)
         left, weights = left[undecided], weights[undecided]
     raise RuntimeError(
-        f"{len(left)} of {len(start)} intersections undecided after {MAX_CUTS} linearisations; "
+        f"{len(left)} of {len(start)} intersections undecided after {MAX_CUTS} linearizations; "
         f"the first has slack {found.slack[left][0]:.3g}, at most {found.upper_bound[left][0]:.3g}"
     )
 
 
-def _linearised(
+def _linearized(
     sets: Sequence[ConstraintSet], index: Tensor, batch: int, action: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return slacks ``(B, len(sets))`` and their gradients ``(B, len(sets), d)``."""

@@ -32,7 +32,7 @@ class Ellipsoid(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "scale_tril": 2}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "center", self.center.isinf(), "a finite center"
         yield "scale_tril", self.scale_tril.isinf(), "finite elements"
         yield "scale_tril", self.scale_tril.triu(1) != 0, "zeros above the diagonal"
@@ -58,11 +58,11 @@ class Ellipsoid(ConstraintSet):
         white = vector_norm(self.whiten(action - self.center), dim=-1)
         return (1 - white) / self._inverse_norm()
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        offset = self.whiten(centre - self.center)
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        offset = self.whiten(anchor - self.center)
         return partial(self._gauge, ball_gauge_about(offset, torch.ones_like(offset[..., 0])))
 
     def _gauge(self, of_unit_ball: Gauge, direction: Tensor) -> Tensor:
@@ -82,9 +82,9 @@ class Ellipsoid(ConstraintSet):
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         scale_tril = self._identity() * radius[..., None, None]
-        return type(self)(centre, scale_tril, validate_args=False)
+        return type(self)(center, scale_tril, validate_args=False)
 
     def superlevel(self) -> Cone:
         inverse = solve_triangular(self.scale_tril, self._identity(), upper=False)

@@ -34,7 +34,7 @@ class HalfSpaces(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
 
@@ -55,11 +55,11 @@ class HalfSpaces(ConstraintSet):
         offsets, lengths = self._offsets_and_lengths()
         return ((offsets - _rows(self.normals, action)) / lengths).amin(-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        room = self._offsets_and_lengths()[0] - _rows(self.normals, centre)
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        room = self._offsets_and_lengths()[0] - _rows(self.normals, anchor)
         return partial(_gauge, self.normals, room.reciprocal())
 
     def bounding_box(self) -> Box:
@@ -77,10 +77,10 @@ class HalfSpaces(ConstraintSet):
         offsets = torch.where(self.offsets.isinf(), self.offsets, self.offsets - eps * size)
         return type(self)(self.normals, offsets, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
         normals[..., 0] = 1
-        offsets = centre[..., :1] + radius.unsqueeze(-1)
+        offsets = center[..., :1] + radius.unsqueeze(-1)
         return type(self)(
             normals.expand_as(self.normals),
             offsets.expand(*offsets.shape[:-1], self.offsets.shape[-1]),

@@ -37,7 +37,7 @@ class KinkedSumBound(ConstraintSet):
     def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return :math:`\alpha \ge 0` and :math:`\beta \le 0`, each ``(*batch, d)``."""
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "weights", self.weights.isinf(), "a finite weight"
         yield "bound", (self.bound <= 0) | self.bound.isinf(), "a finite bound > 0"
 
@@ -48,16 +48,16 @@ class KinkedSumBound(ConstraintSet):
         """Return ``(bound - sum) / |weights|``; infinite where all weights are zero."""
         return (self.bound - self._total(self.weights, action)) / vector_norm(self.weights, dim=-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        r"""Return the gauge about a centre, in O(d log d).
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        r"""Return the gauge about an anchor, in O(d log d).
 
         Along the ray the sum is convex and piecewise linear in t with at most d kinks. Each piece
         is part of a line :math:`I_j + S_j t` that lies below the sum everywhere, so
         :math:`g = \max(0, \max_j S_j / (bound - I_j))`, where a piece's :math:`bound - I_j` is
         positive because the sum at t = 0 is below the bound.
         """
-        side = self._side_at_exit(direction.detach(), centre.detach())
-        room = self.bound - (side * centre).sum(-1)
+        side = self._side_at_exit(direction.detach(), anchor.detach())
+        room = self.bound - (side * anchor).sum(-1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
     def bounding_box(self) -> Box:
@@ -66,10 +66,10 @@ class KinkedSumBound(ConstraintSet):
         # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
         return Box(-bound / lower.abs(), bound / upper, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        # The sum is at most |centre|_1 at the centre, and grows at most by one each unit.
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        # The sum is at most |center|_1 at the center, and grows at most by one each unit.
         weights = torch.full_like(self.weights, self.dim**-0.5)
-        return type(self)(weights, centre.abs().sum(-1) + radius, validate_args=False)
+        return type(self)(weights, center.abs().sum(-1) + radius, validate_args=False)
 
     def superlevel(self) -> KinkedSum:
         return KinkedSum(*self.slopes(self.weights), self.bound, vector_norm(self.weights, dim=-1))
@@ -78,19 +78,19 @@ class KinkedSumBound(ConstraintSet):
         upper, lower = self.slopes(weights)
         return torch.maximum(upper * action, lower * action).sum(-1)
 
-    def _side_at_exit(self, direction: Tensor, centre: Tensor) -> Tensor:
+    def _side_at_exit(self, direction: Tensor, anchor: Tensor) -> Tensor:
         """Return the slope of each term where the ray leaves the set, ``(*batch, d)``."""
-        centre, direction, _ = torch.broadcast_tensors(centre, direction, self.bound.unsqueeze(-1))
-        starts_up = (centre > 0) | ((centre == 0) & (direction > 0))
+        anchor, direction, _ = torch.broadcast_tensors(anchor, direction, self.bound.unsqueeze(-1))
+        starts_up = (anchor > 0) | ((anchor == 0) & (direction > 0))
         ends_up = torch.where(direction == 0, starts_up, direction > 0)
         upper, lower = self.slopes(self.weights)
         before, after = torch.where(starts_up, upper, lower), torch.where(ends_up, upper, lower)
-        kinks = torch.where(starts_up == ends_up, torch.inf, -centre / direction)
+        kinks = torch.where(starts_up == ends_up, torch.inf, -anchor / direction)
         turn = after - before
-        kinks, turn, centre_, direction_ = torch.broadcast_tensors(kinks, turn, centre, direction)
+        kinks, turn, anchor_, direction_ = torch.broadcast_tensors(kinks, turn, anchor, direction)
         ordered, order = kinks.sort(-1)
         slopes = _running(before * direction, (turn * direction_).gather(-1, order))
-        intercepts = _running(before * centre, (turn * centre_).gather(-1, order))
+        intercepts = _running(before * anchor, (turn * anchor_).gather(-1, order))
         last = (slopes / (self.bound.unsqueeze(-1) - intercepts)).argmax(-1, keepdim=True)
         # Kinks are positive: before the first one, none has been passed.
         ordered = torch.cat([torch.full_like(ordered[..., :1], -1.0), ordered], -1)

@@ -23,7 +23,7 @@ def onto_box(box: Box, point: Tensor) -> Tensor:
 def onto_ball(ball: Ball, point: Tensor) -> Tensor:
     r"""Return :math:`m + (a - m)\, r / \max(|a - m|, r)`."""
     offset = point - ball.center
-    # Not min(1, r / |a - m|), whose gradient is NaN at the centre.
+    # Not min(1, r / |a - m|), whose gradient is NaN at the anchor.
     reach = vector_norm(offset, dim=-1).clamp(min=ball.radius)
     return ball.center + offset * (ball.radius / reach).unsqueeze(-1)
 
@@ -124,7 +124,7 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
     convex sets in Hilbert spaces".
 
     Args:
-        region: of sets with closed-form projections; its centre is not used.
+        region: of sets with closed-form projections; its anchor is not used.
         point: ``(*batch, d)``.
         rounds: how often each set has its turn in Dykstra's algorithm, >= 1.
 

@@ -1,4 +1,4 @@
-"""The region of allowed actions in a state: an intersection of sets, seen from one centre."""
+"""The region of allowed actions in a state: an intersection of sets, seen from one anchor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Region:
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        centre: a point strictly inside all active sets, ``(*batch, d)``.
+        anchor: a point strictly inside all active sets, ``(*batch, d)``.
         active: which sets hold in which state, boolean ``(*batch, K + 1)``; None means all.
 
     Raises:
@@ -28,7 +28,7 @@ class Region:
     """
 
     sets: tuple[ConstraintSet, ...]
-    centre: Tensor
+    anchor: Tensor
     active: Tensor | None = None
     validate_args: InitVar[bool] = True
 
@@ -38,10 +38,10 @@ class Region:
         if not self.sets or not isinstance(self.sets[0], Box):
             given = [type(each).__name__ for each in self.sets]
             raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-        dims = [each.dim for each in self.sets] + [int(self.centre.shape[-1])]
+        dims = [each.dim for each in self.sets] + [int(self.anchor.shape[-1])]
         if len(set(dims)) > 1:
             raise GeometryError(
-                f"sets and centre: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
+                f"sets and anchor: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
             )
 
     @property
@@ -57,14 +57,14 @@ class Region:
         The gauge of an intersection is the maximum of the gauges, so this is a running maximum; a
         set that is not active adds nothing.
         """
-        running = [self.sets[0].gauge(direction, self.centre)]
+        running = [self.sets[0].gauge(direction, self.anchor)]
         for stage in range(1, len(self.sets)):
             running.append(torch.maximum(running[-1], self._gauge(stage, direction)))
         return torch.stack(torch.broadcast_tensors(*running))
 
     def outer_and_inner_gauge(self, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gauges of the action bounds and of the whole region, each ``(*batch,)``."""
-        outer = inner = self.sets[0].gauge(direction, self.centre)
+        outer = inner = self.sets[0].gauge(direction, self.anchor)
         for stage in range(1, len(self.sets)):
             inner = torch.maximum(inner, self._gauge(stage, direction))
         return outer, inner
@@ -91,38 +91,38 @@ class Region:
         that all sets of the result are active: nothing needs a mask, and no gradient is NaN.
 
         Raises:
-            GeometryError: when sets and centre have several dtypes, in the coarser ones of which
+            GeometryError: when sets and anchor have several dtypes, in the coarser ones of which
                 the erosion by the finer one's rounding error is none.
         """
         dtypes = [each.dtype for each in self.sets]
-        if any(dtype != self.centre.dtype for dtype in dtypes):
+        if any(dtype != self.anchor.dtype for dtype in dtypes):
             raise GeometryError(
-                f"sets and centre: expected one dtype, given {dtypes} and {self.centre.dtype}; "
+                f"sets and anchor: expected one dtype, given {dtypes} and {self.anchor.dtype}; "
                 "convert them with .to(dtype)"
             )
         magnitude = self.bounds.magnitude()
         sets = [each.eroded(magnitude) for each in self.sets]
         if self.active is not None:
             # No two points of the bounds are further apart than half of it.
-            beyond = magnitude * (4 * self.centre.shape[-1] ** 0.5)
+            beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
             for stage in range(1, len(sets)):
                 active = self.active[..., stage]
-                sets[stage] = sets[stage].unless_dropped(active, self.centre, beyond)
-        return type(self)(tuple(sets), self.centre, validate_args=False)
+                sets[stage] = sets[stage].unless_dropped(active, self.anchor, beyond)
+        return type(self)(tuple(sets), self.anchor, validate_args=False)
 
     @classmethod
-    def build(cls, sets: Sequence[ConstraintSet], centre: Tensor | None = None) -> Self:
-        """Find centre and active flags by the lexicographic rule, highest priority first.
+    def build(cls, sets: Sequence[ConstraintSet], anchor: Tensor | None = None) -> Self:
+        """Find anchor and active flags by the lexicographic rule, highest priority first.
 
-        See `cnfp_torchrl.geometry.centres.lexicographic_centre`.
+        See `cnfp_torchrl.geometry.anchors.lexicographic_anchor`.
         """
-        from cnfp_torchrl.geometry.centres import lexicographic_centre
+        from cnfp_torchrl.geometry.anchors import lexicographic_anchor
 
-        point, active = lexicographic_centre(sets, centre)
+        point, active = lexicographic_anchor(sets, anchor)
         return cls(tuple(sets), point, active)
 
     def _gauge(self, stage: int, direction: Tensor) -> Tensor:
-        return self._unless_dropped(stage, self.sets[stage].gauge(direction, self.centre), 0.0)
+        return self._unless_dropped(stage, self.sets[stage].gauge(direction, self.anchor), 0.0)
 
     def _unless_dropped(self, stage: int, value: Tensor, neutral: float | bool) -> Tensor:
         if self.active is None:

@@ -45,7 +45,7 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """B problems "maximise t such that all sets have slack t", as stacks of rows, cones and sums.
+    """B problems "maximize t such that all sets have slack t", as stacks of rows, cones and sums.
 
     Fields carry B first; each kind has a weight of 1, or of 0 where it is to be ignored.
     """

@@ -1,4 +1,4 @@
-r"""Descriptions of superlevel sets :math:`\{a : slack(a) \ge t\}`, by which centres are found.
+r"""Descriptions of superlevel sets :math:`\{a : slack(a) \ge t\}`, by which anchors are found.
 
 A convex family states one of them in `ConstraintSet.superlevel`. The solver
 (`cnfp_torchrl.geometry.barrier`) knows the logarithmic barrier of each kind, so a family needs no

@@ -37,7 +37,7 @@ class TaskSpaceBall(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"jacobian": 2, "offset": 1, "radius": 0}
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "jacobian", self.jacobian.isinf(), "finite elements"
         yield "offset", self.offset.isinf(), "a finite offset"
         yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
@@ -64,13 +64,13 @@ class TaskSpaceBall(ConstraintSet):
         distance = vector_norm(_image(self.jacobian, action) + self.offset, dim=-1)
         return (self.radius - distance) / self._norm()
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return self.gauge_about(centre)(direction)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
+    def gauge_about(self, anchor: Tensor) -> Gauge:
         # In units of J's norm: what vanishes does so beside it, not beside one.
         norm = self._norm()
-        offset = (_image(self.jacobian, centre) + self.offset) / norm.unsqueeze(-1)
+        offset = (_image(self.jacobian, anchor) + self.offset) / norm.unsqueeze(-1)
         jacobian = self.jacobian / norm[..., None, None]
         return partial(_gauge, jacobian, ball_gauge_about(offset, self.radius / norm))
 
@@ -82,8 +82,8 @@ class TaskSpaceBall(ConstraintSet):
         radius = torch.sub(self.radius, size, alpha=eps)
         return type(self)(self.jacobian, self.offset, radius, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        offset = -_image(self.jacobian, centre)
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        offset = -_image(self.jacobian, center)
         return type(self)(self.jacobian, offset, self._norm() * radius, validate_args=False)
 
     def superlevel(self) -> Cone:

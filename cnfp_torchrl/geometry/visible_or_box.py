@@ -60,9 +60,9 @@ class VisibleOrBox(ConstraintSet):
         """Where the visible region counts, boolean ``(*batch,)``."""
         return self.in_sight > 0
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield from self.region.violations()
-        yield from self.box.violations()
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield from self.region.invalid_fields()
+        yield from self.box.invalid_fields()
         yield "in_sight", (self.in_sight != 0) & (self.in_sight != 1), "0 or 1"
 
     def shape_problem(self) -> str | None:
@@ -74,13 +74,13 @@ class VisibleOrBox(ConstraintSet):
     def slack(self, action: Tensor) -> Tensor:
         return torch.where(self.sees, self.region.slack(action), self.box.slack(action))
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        # Each is replaced where it does not count: its gauge about a centre outside of it may be
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        # Each is replaced where it does not count: its gauge about an anchor outside of it may be
         # NaN, and so would the gradient be, even where it is masked.
         one = torch.ones_like(self.in_sight)
-        region = self.region.unless_dropped(self.sees, centre, one)
-        box = self.box.unless_dropped(~self.sees, centre, one)
-        return torch.where(self.sees, region.gauge(direction, centre), box.gauge(direction, centre))
+        region = self.region.unless_dropped(self.sees, anchor, one)
+        box = self.box.unless_dropped(~self.sees, anchor, one)
+        return torch.where(self.sees, region.gauge(direction, anchor), box.gauge(direction, anchor))
 
     def bounding_box(self) -> Box:
         return self.region.bounding_box().where(self.sees, self.box)
@@ -89,8 +89,8 @@ class VisibleOrBox(ConstraintSet):
         fields = {**self.region.eroded(magnitude).fields(), **self.box.eroded(magnitude).fields()}
         return type(self)(**fields, in_sight=self.in_sight, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        parts = (self.region.around(centre, radius), self.box.around(centre, radius))
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        parts = (self.region.around(center, radius), self.box.around(center, radius))
         fields = {name: value for part in parts for name, value in part.fields().items()}
         return type(self)(**fields, in_sight=torch.zeros_like(self.in_sight), validate_args=False)
 

@@ -19,7 +19,7 @@ class VisibleRegion(ConstraintSet):
     r"""Actions whose move, from p straight to :math:`p + step\, a`, touches no closed rectangle.
 
     Star-shaped about 0, not convex: what a rectangle R hides is its shadow
-    :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another centre c
+    :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another anchor c
     the gauge is that of the part which c sees, up to where a ray first enters a shadow; it lies in
     the true set and is star-shaped about c, so a flow into it stays sound and exact. Gauges jump
     where rays graze a corner: the density is exact almost everywhere, a pathwise gradient leaves
@@ -55,7 +55,7 @@ class VisibleRegion(ConstraintSet):
             [torch.stack([-infinite, below], -2), torch.stack([above, infinite], -2)], -3
         )
 
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         low, high = self.rectangles.unbind(-2)
         nowhere = (low > high) | (low == torch.inf) | (high == -torch.inf)
         everywhere = (low.isinf() & high.isinf()).all(-1, keepdim=True).expand_as(low)
@@ -105,7 +105,7 @@ class VisibleRegion(ConstraintSet):
         crossing = torch.where(pair, crossing, -torch.inf).amax((-2, -1))
         return torch.maximum(at_one, crossing).amin(-1)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         r"""Return one over the share t at which the ray c + t v first enters a shadow, or 0.
 
         In a shadow means :math:`\tau l \le c + t v \le \tau h` for a :math:`\tau \ge 1`.
@@ -113,7 +113,7 @@ class VisibleRegion(ConstraintSet):
         those rows.
         """
         low, high, v, c = torch.broadcast_tensors(
-            *self._in_action_units(), direction.unsqueeze(-2), centre.unsqueeze(-2)
+            *self._in_action_units(), direction.unsqueeze(-2), anchor.unsqueeze(-2)
         )
         one, zero = torch.ones_like(v[..., :1]), torch.zeros_like(v[..., :1])
         # Rows A tau + B t + C >= 0; an infinite bound asks for nothing, so it becomes tau >= 0.
@@ -152,15 +152,15 @@ class VisibleRegion(ConstraintSet):
         rectangles = torch.stack([low - grown, high + grown], -2)
         return type(self)(self.position, rectangles, self.step, validate_args=False)
 
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        # One wall, the radius or more beyond 0, which the centre moves the position to.
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        # One wall, the radius or more beyond 0, which the center moves the position to.
         low = torch.full_like(self.rectangles[..., 0, :], -torch.inf)
         high = torch.full_like(low, torch.inf)
-        wall = (centre[..., :1].abs() + radius.unsqueeze(-1)).unsqueeze(-2)
+        wall = (center[..., :1].abs() + radius.unsqueeze(-1)).unsqueeze(-2)
         first = torch.arange(self.dim, device=low.device) == 0
         low = torch.where(first, wall, low)
         rectangles = torch.stack(torch.broadcast_tensors(low, high), -2)
-        return type(self)(-centre, rectangles, torch.ones_like(self.step), validate_args=False)
+        return type(self)(-center, rectangles, torch.ones_like(self.step), validate_args=False)
 
     def superlevel(self) -> Rows:
         """Describe a convex part: before each rectangle, the side that leaves the most room."""

@@ -13,9 +13,9 @@ from cnfp_torchrl.modules.flows import (
     ExactFlow,
     Flow,
     GaugeFlow,
-    PaperChain,
     ProjectionFlow,
     RadialFlow,
+    SquashFlow,
     UnconstrainedFlow,
 )
 from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
@@ -33,10 +33,10 @@ __all__ = [
     "GaugeFlow",
     "LatentActor",
     "MissingGeometryError",
-    "PaperChain",
     "ProjectionFlow",
     "RadialFlow",
     "SafeRandomPolicy",
+    "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",
     "constrain",

@@ -12,7 +12,7 @@ from torch import Tensor
 from cnfp_torchrl.bijectors import Bijector, paper_squash
 from cnfp_torchrl.geometry import ConstraintSet
 
-CENTRE_KEY = ("constraints", "centre")
+ANCHOR_KEY = ("constraints", "anchor")
 
 
 class MissingGeometryError(KeyError):
@@ -91,7 +91,7 @@ class ConstraintBijector(TensorDictModuleBase):
 
     @property
     def active_key(self) -> NestedKey:
-        """Where `ConstraintCentre` says whether the constraint holds in a state."""
+        """Where `ConstraintAnchor` says whether the constraint holds in a state."""
         return ("constraints", self.name, "active")
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:

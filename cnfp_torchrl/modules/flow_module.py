@@ -18,22 +18,22 @@ from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Box, Region
 from cnfp_torchrl.modules.constraint_bijector import (
-    CENTRE_KEY,
+    ANCHOR_KEY,
     ConstraintBijector,
     in_order,
     require,
 )
 from cnfp_torchrl.modules.flows import Flow, resolve_flow
 
-_CENTRE_REMEDY = "append cnfp_torchrl.envs.ConstraintCentre after the geometry transforms"
+_ANCHOR_REMEDY = "append cnfp_torchrl.envs.ConstraintAnchor after the geometry transforms"
 
 
 class ConstrainedFlowModule(SafeProbabilisticModule):
     """Draw actions from a Gaussian pushed through the bijectors of all constraints.
 
     Reads the Gaussian's parameters and, for each constraint, the geometry that the environment's
-    transforms publish; an exact flow also reads the centre and the active flags that
-    `cnfp_torchrl.envs.ConstraintCentre` computes. Ends an actor, as TorchRL's own probabilistic
+    transforms publish; an exact flow also reads the anchor and the active flags that
+    `cnfp_torchrl.envs.ConstraintAnchor` computes. Ends an actor, as TorchRL's own probabilistic
     modules do.
 
     Sets are eroded by the rounding error of the action spec's dtype, in which actions are executed:
@@ -47,7 +47,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         order: the constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
         flow: how the sets are combined: a `Flow`, or ``exact``, ``gauge``, ``radial``, ``squash``,
-            ``projection``, ``none``.
+            ``projection``, ``unconstrained``.
         in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
         out_key: the action, ``(*batch, d)``.
         return_log_prob: also write the action's log-density, ``(*batch,)``.
@@ -122,7 +122,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     @property
     def stage_names(self) -> list[str]:
         """Names of the stages of `get_dist(...).stages`, in order of application."""
-        if self.flow.is_exact:
+        if self.flow.is_safe:
             return ["bounds", *self.order]
         return self.order if self.flow.reads_constraints and self.order else ["bounds"]
 
@@ -131,30 +131,30 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if not self.flow.reads_constraints:
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
-        if self.flow.is_exact:
-            keys += [bijector.active_key for bijector in self.bijectors] + [CENTRE_KEY]
+        if self.flow.is_safe:
+            keys += [bijector.active_key for bijector in self.bijectors] + [ANCHOR_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            MissingGeometryError: when geometry, centre or active flags are missing.
+            MissingGeometryError: when geometry, anchor or active flags are missing.
         """
         bounds = self.bounds
         if not self.flow.reads_constraints:
             return self.flow(bounds, [], None, None)
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
-        if not self.flow.is_exact:
+        if not self.flow.is_safe:
             return self.flow(bounds, sets, None, None)
-        centre = self._centre(tensordict).to(self.action_dtype)
-        return self.flow(bounds, sets, centre, self._active(tensordict))
+        anchor = self._anchor(tensordict).to(self.action_dtype)
+        return self.flow(bounds, sets, anchor, self._active(tensordict))
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
-        """Return the region of allowed actions, for any flow; needs centre and active flags."""
+        """Return the region of allowed actions, for any flow; needs anchor and active flags."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
-        centre, active = self._centre(tensordict), self._active(tensordict)
-        return Region((self.bounds, *sets), centre, active)
+        anchor, active = self._anchor(tensordict), self._active(tensordict)
+        return Region((self.bounds, *sets), anchor, active)
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
@@ -182,14 +182,14 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         with set_interaction_type(InteractionType.RANDOM):
             return self(tensordict)
 
-    def _centre(self, tensordict: TensorDictBase) -> Tensor:
-        return require(tensordict, CENTRE_KEY, _CENTRE_REMEDY)
+    def _anchor(self, tensordict: TensorDictBase) -> Tensor:
+        return require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
 
     def _active(self, tensordict: TensorDictBase) -> Tensor | None:
         if not self.bijectors:
             return None
         flags = [
-            require(tensordict, bijector.active_key, _CENTRE_REMEDY) for bijector in self.bijectors
+            require(tensordict, bijector.active_key, _ANCHOR_REMEDY) for bijector in self.bijectors
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
 

@@ -12,13 +12,13 @@ from typing import ClassVar
 from torch import Tensor
 
 from cnfp_torchrl.bijectors import (
-    AlignedSquash,
     Bijector,
-    BijectorChain,
     BoxSquash,
+    ExactSquash,
     GaugeSquash,
     Projection,
     RadialSquash,
+    SquashChain,
     paper_squash,
 )
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
@@ -27,8 +27,8 @@ from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 class Flow(ABC):
     """How the action bounds and the constraints' sets become one bijector."""
 
-    is_exact: ClassVar[bool]
-    """Whether every action satisfies all active constraints; then centre and flags are needed."""
+    is_safe: ClassVar[bool]
+    """Whether every action satisfies all active constraints; then anchor and flags are needed."""
 
     reads_constraints: ClassVar[bool] = True
     """Whether the constraints' sets are looked at."""
@@ -41,7 +41,7 @@ class Flow(ABC):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
+        anchor: Tensor | None,
         active: Tensor | None,
     ) -> Bijector:
         """Return the bijector.
@@ -49,7 +49,7 @@ class Flow(ABC):
         Args:
             bounds: the action bounds.
             sets: the constraints' sets in order of application.
-            centre: a point strictly inside all active sets, ``(*batch, d)``; for exact flows.
+            anchor: a point strictly inside all active sets, ``(*batch, d)``; for exact flows.
             active: which of bounds and sets hold, ``(*batch, K + 1)``; for exact flows.
         """
 
@@ -57,7 +57,7 @@ class Flow(ABC):
 class RegionFlow(Flow):
     """A bijector onto the intersection of the action bounds and all active sets."""
 
-    is_exact = True
+    is_safe = True
 
     @abstractmethod
     def onto(self, region: Region) -> Bijector:
@@ -67,19 +67,19 @@ class RegionFlow(Flow):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
+        anchor: Tensor | None,
         active: Tensor | None,
     ) -> Bijector:
-        assert centre is not None
-        region = Region((bounds, *sets), centre, active, validate_args=False)
+        assert anchor is not None
+        region = Region((bounds, *sets), anchor, active, validate_args=False)
         return self.onto(region)
 
 
 class ExactFlow(RegionFlow):
     """A tanh squash into the action bounds, then retractions into the intersection (default)."""
 
-    def onto(self, region: Region) -> AlignedSquash:
-        return AlignedSquash(region, validate_args=False)
+    def onto(self, region: Region) -> ExactSquash:
+        return ExactSquash(region, validate_args=False)
 
 
 class GaugeFlow(RegionFlow):
@@ -96,7 +96,7 @@ class RadialFlow(RegionFlow):
         return RadialSquash(region)
 
 
-class PaperChain(Flow):
+class SquashFlow(Flow):
     """The paper's chain of squashes, which guarantees the last constraint only.
 
     Args:
@@ -105,7 +105,7 @@ class PaperChain(Flow):
             tanh of a later box. In action units.
     """
 
-    is_exact = False
+    is_safe = False
 
     def __init__(self, max_radius: float = 2.0) -> None:
         if not max_radius > 0:
@@ -116,12 +116,12 @@ class PaperChain(Flow):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
+        anchor: Tensor | None,
         active: Tensor | None,
     ) -> Bijector:
         if not sets:
             return paper_squash(bounds)
-        return BijectorChain(
+        return SquashChain(
             [
                 paper_squash(each.inner_ball(self.max_radius) if isinstance(each, Ball) else each)
                 for each in sets
@@ -153,14 +153,14 @@ class ProjectionFlow(RegionFlow):
 class UnconstrainedFlow(Flow):
     """The tanh squash into the action bounds alone, what any SAC does."""
 
-    is_exact = False
+    is_safe = False
     reads_constraints = False
 
     def __call__(
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        centre: Tensor | None,
+        anchor: Tensor | None,
         active: Tensor | None,
     ) -> BoxSquash:
         return BoxSquash(bounds.low, bounds.high, validate_args=False)
@@ -170,9 +170,9 @@ FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "gauge": GaugeFlow,
     "radial": RadialFlow,
-    "squash": PaperChain,
+    "squash": SquashFlow,
     "projection": ProjectionFlow,
-    "none": UnconstrainedFlow,
+    "unconstrained": UnconstrainedFlow,
 }
 
 

@@ -82,6 +82,6 @@ def guarded(actor: SafeProbabilisticTensorDictSequential) -> TensorDictModuleBas
     Raises:
         TypeError: when the actor is not a constrained one.
     """
-    if not flow_head(actor).flow.is_exact:
+    if not flow_head(actor).flow.is_safe:
         return actor
     return TensorDictSequential(actor, ExecutedActionGuard(actor))

@@ -1,25 +1,25 @@
 """A checker for families of sets of one's own, in the spirit of `torch.autograd.gradcheck`.
 
-`check_constraint_set` takes an example of a family and centres inside its sets, and raises a
+`check_constraint_set` takes an example of a family and anchors inside its sets, and raises a
 `FamilyError` that names the method that breaks the contract of `ConstraintSet`, and where.
 
 Of fields and shapes:
 
 - `check_event_dims`: it maps each field to its number of event dimensions and fits the example,
-- `check_violations`: it yields what it has to, and accepts the example,
+- `check_invalid_fields`: it yields what it has to, and accepts the example,
 - `check_output_shapes`: shapes ``(*sample, *batch)`` of results, event shapes of sets,
 - `check_batches`: batch elements do not mix, and batch shapes broadcast.
 
-Of slack and containment, and of what the search for centres is told:
+Of slack and containment, and of what the search for anchors is told:
 
-- `check_slack_at_the_centre`, `check_contains_agrees_with_slack`, `check_contains_is_exact`,
+- `check_slack_at_the_anchor`, `check_contains_agrees_with_slack`, `check_contains_is_exact`,
 - `check_slack_bounds_the_distance`: no action nearer than the slack is outside,
 - `check_slack_is_concave`: with the right gradient, unless `superlevel` is stated,
 - `check_superlevel`: it describes no more than the set, and all of a convex one,
 - `check_search_keeps_the_set`: what holds is not dropped,
 - `check_bounding_box`: it holds the set.
 
-Of gauges, about the given centre and about others near the boundary, where arithmetic is worst:
+Of gauges, about the given anchor and about others near the boundary, where arithmetic is worst:
 
 - `check_gauge_is_where_rays_leave`: by steps along the ray, judged by `contains`,
 - `check_gauge_is_homogeneous`, `check_gauge_about`,

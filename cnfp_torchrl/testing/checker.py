@@ -12,19 +12,19 @@ from cnfp_torchrl.testing.example import Example
 # Each check may rely on what those before it have found to be right.
 OF_SHAPES = (
     shapes.check_event_dims,
-    shapes.check_violations,
+    shapes.check_invalid_fields,
     shapes.check_output_shapes,
     shapes.check_batches,
 )
-ABOUT_THE_GIVEN_CENTRE = (
-    slacks.check_slack_at_the_centre,
+ABOUT_THE_GIVEN_ANCHOR = (
+    slacks.check_slack_at_the_anchor,
     slacks.check_contains_agrees_with_slack,
     slacks.check_slack_bounds_the_distance,
     slacks.check_slack_is_concave,
     slacks.check_superlevel,
     gauges.check_gauge_is_where_rays_leave,
 )
-ABOUT_ALL_CENTRES = (
+ABOUT_ALL_ANCHORS = (
     gauges.check_gauge_is_where_rays_leave,
     gauges.check_gauge_is_homogeneous,
     gauges.check_gauge_about,
@@ -45,7 +45,7 @@ ABOUT_ALL_CENTRES = (
 
 def check_constraint_set(
     sets: ConstraintSet,
-    centre: Tensor,
+    anchor: Tensor,
     *,
     bounds: Box | None = None,
     samples: int = 100,
@@ -56,25 +56,25 @@ def check_constraint_set(
     Args:
         sets: a batch of different sets of the family, float32 or float64; of their numbers those
             count that float32 holds.
-        centre: a point well inside each set, ``(*batch, d)``; best not its middle. A set that is
+        anchor: a point well inside each set, ``(*batch, d)``; best not its middle. A set that is
             not convex must be star-shaped about it.
-        bounds: finite action bounds that hold the centres and are wider than the sets in some
+        bounds: finite action bounds that hold the anchors and are wider than the sets in some
             directions; by default some times wider than the sets are where they are narrow.
-        samples: directions from each of the centres, the given one and four near the boundary.
+        samples: directions from each of the anchors, the given one and four near the boundary.
         seed: of the checker's own random numbers; the global ones are left alone.
 
     Raises:
         FamilyError: naming family, method, batch element with its fields, direction or action, what
             was expected and given.
-        ValueError: when the centre has another dtype, or the bounds do not hold the centres.
+        ValueError: when the anchor has another dtype, or the bounds do not hold the anchors.
     """
     for check_shapes in OF_SHAPES:
-        check_shapes(sets, centre)
+        check_shapes(sets, anchor)
     # Whatever mode the caller is in, gradients are needed, and a family may draw random numbers.
     with torch.enable_grad(), torch.random.fork_rng(devices=[]):
-        example = Example.of(sets, centre, bounds, samples, seed)
-        for check in ABOUT_THE_GIVEN_CENTRE:
+        example = Example.of(sets, anchor, bounds, samples, seed)
+        for check in ABOUT_THE_GIVEN_ANCHOR:
             check(example)
-        example = example.with_centres_near_the_boundary(samples)
-        for check in ABOUT_ALL_CENTRES:
+        example = example.with_anchors_near_the_boundary(samples)
+        for check in ABOUT_ALL_ANCHORS:
             check(example)

@@ -1,4 +1,4 @@
-"""The example that a family is checked with: sets, centres inside them, and rays from those."""
+"""The example that a family is checked with: sets, anchors inside them, and rays from those."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from cnfp_torchrl.geometry import MINIMUM_SLACK, Box, ConstraintSet
 DTYPES = (torch.float32, torch.float64)
 
 _DEPTHS = (0.3, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
-"""Shares of the way from a boundary back to the centre, at which further centres are tried."""
+"""Shares of the way from a boundary back to the anchor, at which further anchors are tried."""
 
 
 class View(NamedTuple):
-    """A centre, and ways from it to the action bounds.
+    """An anchor, and ways from it to the action bounds.
 
     Args:
-        centre: ``(B, d)``.
+        anchor: ``(B, d)``.
         ways: ``(N, B, d)``; the bounds' gauge of each is about 1.
     """
 
-    centre: Tensor
+    anchor: Tensor
     ways: Tensor
 
     def cast(self, dtype: torch.dtype) -> View:
         """Return the same in a dtype."""
-        return View(self.centre.to(dtype), self.ways.to(dtype))
+        return View(self.anchor.to(dtype), self.ways.to(dtype))
 
     def at(self, gauge: Tensor) -> Tensor:
-        """Return the points ``centre + way / gauge``, ``(N, B, d)``."""
-        return self.centre + self.ways / gauge.unsqueeze(-1)
+        """Return the points ``anchor + way / gauge``, ``(N, B, d)``."""
+        return self.anchor + self.ways / gauge.unsqueeze(-1)
 
 
 @dataclass(frozen=True)
 class Example:
-    """Sets and centres, flat and in float64, of numbers that float32 holds too.
+    """Sets and anchors, flat and in float64, of numbers that float32 holds too.
 
     Args:
         sets: of batch shape ``(B,)``.
-        bounds: finite action bounds around the centres, of batch shape ``(B,)``.
-        views: one for each centre, the given one first.
+        bounds: finite action bounds around the anchors, of batch shape ``(B,)``.
+        views: one for each anchor, the given one first.
         random: what draws all random numbers.
     """
 
@@ -55,31 +55,31 @@ class Example:
 
     @classmethod
     def of(
-        cls, sets: ConstraintSet, centre: Tensor, bounds: Box | None, samples: int, seed: int
+        cls, sets: ConstraintSet, anchor: Tensor, bounds: Box | None, samples: int, seed: int
     ) -> Self:
         """Flatten an example whose shapes are known to be right.
 
         Raises:
-            ValueError: when the bounds are not finite or do not hold the centres.
+            ValueError: when the bounds are not finite or do not hold the anchors.
         """
-        batch = torch.broadcast_shapes(sets.batch_shape, centre.shape[:-1])
-        index = torch.arange(batch.numel(), device=centre.device)
+        batch = torch.broadcast_shapes(sets.batch_shape, anchor.shape[:-1])
+        index = torch.arange(batch.numel(), device=anchor.device)
         flat = sets.select(batch, index).with_fields(lambda field, _: _rounded(field))
-        centre = _rounded(centre.detach().expand(*batch, -1).reshape(-1, centre.shape[-1]))
+        anchor = _rounded(anchor.detach().expand(*batch, -1).reshape(-1, anchor.shape[-1]))
         random = torch.Generator().manual_seed(seed)
         if bounds is None:
-            around = _bounds_about(flat, centre, random)
+            around = _bounds_about(flat, anchor, random)
         else:
             bounds = bounds.with_fields(lambda field, _: _rounded(field))
             low, high = (each.expand(*batch, -1) for each in (bounds.low, bounds.high))
-            around = Box(low.reshape_as(centre), high.reshape_as(centre))
-        if not bool((around.slack(centre) > 0).all() and around.magnitude().isfinite().all()):
+            around = Box(low.reshape_as(anchor), high.reshape_as(anchor))
+        if not bool((around.slack(anchor) > 0).all() and around.magnitude().isfinite().all()):
             raise ValueError(
-                "bounds: expected finite action bounds with the centres strictly inside, given "
+                "bounds: expected finite action bounds with the anchors strictly inside, given "
                 f"low {around.low.tolist()}, high {around.high.tolist()}"
             )
         example = cls(flat, around, (), random)
-        return replace(example, views=(example.view(centre, example.ways(samples)),))
+        return replace(example, views=(example.view(anchor, example.ways(samples)),))
 
     @property
     def size(self) -> Tensor:
@@ -110,25 +110,25 @@ class Example:
         each = torch.arange(count, device=gauss.device)
         return kinds[each % len(kinds), each]
 
-    def view(self, centre: Tensor, directions: Tensor) -> View:
-        """Return the view from a centre in directions that are not zero."""
-        room = self.bounds.gauge(directions, centre).unsqueeze(-1)
-        return View(centre, _rounded(directions / room))
+    def view(self, anchor: Tensor, directions: Tensor) -> View:
+        """Return the view from an anchor in directions that are not zero."""
+        room = self.bounds.gauge(directions, anchor).unsqueeze(-1)
+        return View(anchor, _rounded(directions / room))
 
     def actions(self, count: int) -> Tensor:
         """Return actions ``(count, B, d)`` up to twice as far as the bounds, at all distances."""
-        centre = self.views[0].centre
-        view = self.view(centre, self.ways(count))
-        share = 2 * 1e-4 ** self.uniform(count, len(centre), 1)
-        return centre + view.ways * share
+        anchor = self.views[0].anchor
+        view = self.view(anchor, self.ways(count))
+        share = 2 * 1e-4 ** self.uniform(count, len(anchor), 1)
+        return anchor + view.ways * share
 
-    def with_centres_near_the_boundary(self, samples: int) -> Self:
-        """Return the example with further centres, as near as the search for centres may find any.
+    def with_anchors_near_the_boundary(self, samples: int) -> Self:
+        """Return the example with further anchors, as near as the search for anchors may find any.
 
         From each some ways lead straight towards the boundary, away from it and along it, where a
         gauge that subtracts large numbers is worst.
         """
-        given = self.views[0].centre
+        given = self.views[0].anchor
         twice = [each.to(torch.float32) for each in (self.bounds, self.sets)]
         magnitude = twice[0].bounding_box().magnitude()
         twice = [each.eroded(magnitude).eroded(magnitude) for each in twice]
@@ -136,12 +136,12 @@ class Example:
         views = [self.views[0]]
         for way in self.ways(4):
             gauge = torch.maximum(*(each.gauge(way, given) for each in twice)).unsqueeze(-1)
-            centre = given
+            anchor = given
             for depth in _DEPTHS:
                 trial = _rounded(given + way * (1 - depth) / gauge)
                 slack = torch.minimum(*(each.slack(trial) for each in twice)).unsqueeze(-1)
-                centre = torch.where(slack >= MINIMUM_SLACK, trial, centre)
-            views.append(self.view(centre, self._ways_about(centre - given, samples)))
+                anchor = torch.where(slack >= MINIMUM_SLACK, trial, anchor)
+            views.append(self.view(anchor, self._ways_about(anchor - given, samples)))
         return replace(self, views=tuple(views))
 
     def _ways_about(self, towards: Tensor, count: int) -> Tensor:
@@ -163,15 +163,15 @@ def _rounded(value: Tensor) -> Tensor:
     return value.detach().float().double()
 
 
-def _bounds_about(sets: ConstraintSet, centre: Tensor, random: torch.Generator) -> Box:
-    """Return bounds some times wider than the set is where it is narrow, not centred."""
-    ways = torch.randn(32, *centre.shape, generator=random, dtype=torch.float64).to(centre)
+def _bounds_about(sets: ConstraintSet, anchor: Tensor, random: torch.Generator) -> Box:
+    """Return bounds some times wider than the set is where it is narrow, not centered."""
+    ways = torch.randn(32, *anchor.shape, generator=random, dtype=torch.float64).to(anchor)
     ways = ways / vector_norm(ways, dim=-1, keepdim=True)
-    slack = sets.slack(centre).nan_to_num(1.0, posinf=1.0)
+    slack = sets.slack(anchor).nan_to_num(1.0, posinf=1.0)
     length = slack.expand(ways.shape[:-1]).clamp(1e-6, 1e6)
     # Not for ever: about a set that is open in most directions, bounds are a matter of taste.
     for _ in range(6):
-        inside = sets.contains(centre + length.unsqueeze(-1) * ways)
+        inside = sets.contains(anchor + length.unsqueeze(-1) * ways)
         length = torch.where(inside, 2 * length, length)
     half = length.amin(0).unsqueeze(-1)
-    return Box(_rounded(centre - 3 * half), _rounded(centre + 5 * half))
+    return Box(_rounded(anchor - 3 * half), _rounded(anchor + 5 * half))

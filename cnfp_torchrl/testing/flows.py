@@ -11,7 +11,7 @@ from cnfp_torchrl.testing.example import DTYPES, Example
 from cnfp_torchrl.testing.family_error import require
 
 ROUNDING_IN_EPS = 2.0
-"""By how many units of rounding error of centre and action an action is off, at least."""
+"""By how many units of rounding error of anchor and action an action is off, at least."""
 
 LARGEST_EROSION_IN_EPS = 1e4
 """How many units of rounding error, of numbers as large as actions, `eroded` may take away."""
@@ -24,15 +24,15 @@ def check_erosion_covers_rounding(example: Example) -> None:
     sets = example.cast(torch.float32)[1]
     eroded = sets.eroded(example.size.float()).to(torch.float64)
     for view in example.views:
-        gauge = eroded.gauge(view.ways, view.centre)
+        gauge = eroded.gauge(view.ways, view.anchor)
         action = view.at(gauge.clamp(min=1)).requires_grad_()
         (uphill,) = torch.autograd.grad(example.sets.slack(action).sum(), action)
         action = action.detach()
-        moved = action - uphill.sign() * eps * (action.abs() + view.centre.abs())
+        moved = action - uphill.sign() * eps * (action.abs() + view.anchor.abs())
         holds = example.sets.contains(moved) | (gauge < 1)
         slack = example.sets.slack(action)
         expected = "room for rounding errors of all numbers that enter"
-        at = {"direction": view.ways, "centre": view.centre, "action": action}
+        at = {"direction": view.ways, "anchor": view.anchor, "action": action}
         require(sets, "eroded", holds, expected, "at the eroded boundary a slack of", slack, **at)
 
 
@@ -43,11 +43,11 @@ def check_erosion_is_small(example: Example) -> None:
         eroded = sets.eroded(example.size.to(dtype)).to(torch.float64)
         most = LARGEST_EROSION_IN_EPS * torch.finfo(dtype).eps * example.size
         for view in example.views:
-            gauge = eroded.gauge(view.ways, view.centre)
+            gauge = eroded.gauge(view.ways, view.anchor)
             depth = example.sets.slack(view.at(gauge.clamp(min=1)))
             holds = (depth <= most) | (gauge < 1)
             expected = f"rounding errors taken away, {float(most.amin()):.3g} at most"
-            at = {"direction": view.ways, "centre": view.centre}
+            at = {"direction": view.ways, "anchor": view.anchor}
             require(sets, "eroded", holds, expected, "a depth of", depth, **at)
 
 
@@ -56,7 +56,7 @@ def check_flow_stays_inside(example: Example) -> None:
     for dtype in DTYPES:
         bounds, sets = example.cast(dtype)
         for view in (each.cast(dtype) for each in example.views):
-            region = Region((bounds, sets), view.centre)
+            region = Region((bounds, sets), view.anchor)
             inner = region.eroded()
             gauge = inner.outer_and_inner_gauge(view.ways)[1]
             flow = GaugeSquash(region)
@@ -66,15 +66,15 @@ def check_flow_stays_inside(example: Example) -> None:
             action = torch.cat(actions)
             slack = example.sets.slack(action.double())
             expected = "actions of a flow into the eroded set to lie in the set"
-            at = {"action": action, "centre": view.centre}
+            at = {"action": action, "anchor": view.anchor}
             require(sets, "eroded", sets.contains(action), expected, "a slack of", slack, **at)
 
 
 def check_log_det(example: Example) -> None:
     """A flow's log-determinant, which trusts the gauge to be homogeneous, is autograd's."""
     view = example.views[0]
-    flow = GaugeSquash(Region((example.bounds, example.sets), view.centre))
-    latent = example.normal(8, *view.centre.shape).requires_grad_()
+    flow = GaugeSquash(Region((example.bounds, example.sets), view.anchor))
+    latent = example.normal(8, *view.anchor.shape).requires_grad_()
     action, log_det = flow.forward_and_log_det(latent)
     rows = [
         torch.autograd.grad(action[..., i].sum(), latent, retain_graph=True)[0]
@@ -82,7 +82,7 @@ def check_log_det(example: Example) -> None:
     ]
     error = (slogdet(torch.stack(rows, -2)).logabsdet - log_det).abs().detach()
     expected = "a homogeneous gauge with its gradient, so that log-determinants are right"
-    at = {"latent": latent.detach(), "centre": view.centre}
+    at = {"latent": latent.detach(), "anchor": view.anchor}
     require(example.sets, "gauge", error < 1e-6, expected, "an error of", error, **at)
 
 
@@ -90,23 +90,23 @@ def check_around_contains_the_ball(example: Example) -> None:
     """`around` contains the ball, wherever it is, and has finite gauges and gradients about it."""
     for dtype in DTYPES:
         sets = example.cast(dtype)[1]
-        for way in example.view(example.views[0].centre, example.ways(5)).ways:
-            centre = (example.views[0].centre + 2 * way).to(dtype)
-            radius = (0.5 + 4 * example.uniform(len(centre))).to(dtype) * example.size.to(dtype)
-            around = sets.around(centre, radius)
+        for way in example.view(example.views[0].anchor, example.ways(5)).ways:
+            anchor = (example.views[0].anchor + 2 * way).to(dtype)
+            radius = (0.5 + 4 * example.uniform(len(anchor))).to(dtype) * example.size.to(dtype)
+            around = sets.around(anchor, radius)
             ways = example.ways(50).to(dtype)
             ways = ways / vector_norm(ways, dim=-1, keepdim=True)
-            action = centre + ways * (radius * (1 - 1e-5)).unsqueeze(-1)
-            at = {"ball_centre": centre, "action": action}
+            action = anchor + ways * (radius * (1 - 1e-5)).unsqueeze(-1)
+            at = {"ball_center": anchor, "action": action}
             expected = "the whole ball inside"
             require(
                 sets, "around", around.contains(action), expected, "one of radius", radius, **at
             )
             ways.requires_grad_()
-            gauge = around.gauge(ways, centre)
+            gauge = around.gauge(ways, anchor)
             (gradient,) = torch.autograd.grad(gauge.sum(), ways)
             finite = gauge.isfinite() & gradient.isfinite().all(-1)
-            expected = "finite gauges with finite gradients about the ball's centre"
+            expected = "finite gauges with finite gradients about the ball's center"
             require(sets, "around", finite, expected, "a gauge of", gauge.detach(), **at)
 
 
@@ -116,21 +116,21 @@ def check_dropped_sets_do_not_bind(example: Example) -> None:
     method = "unless_dropped" if own else "around"
     for dtype in DTYPES:
         bounds, sets = example.cast(dtype)
-        inside = example.views[0].centre
+        inside = example.views[0].anchor
         elsewhere = inside + 0.9 * example.view(inside, example.ways(1)).ways[0]
         dropped = torch.arange(len(inside), device=inside.device) % 2 == 0
-        centre = torch.where(dropped.unsqueeze(-1), elsewhere, inside).to(dtype)
+        anchor = torch.where(dropped.unsqueeze(-1), elsewhere, inside).to(dtype)
         active = torch.stack([torch.ones_like(dropped), ~dropped], -1)
         latent = example.normal(len(example.views[0].ways), *inside.shape).to(dtype)
         latent.requires_grad_()
-        flow = GaugeSquash(Region((bounds, sets), centre, active))
+        flow = GaugeSquash(Region((bounds, sets), anchor, active))
         action, log_det = flow.forward_and_log_det(latent)
         (gradient,) = torch.autograd.grad(action.sum() + log_det.sum(), latent)
-        free = GaugeSquash(Region((bounds,), centre)).forward_and_log_det(latent)[0]
+        free = GaugeSquash(Region((bounds,), anchor)).forward_and_log_det(latent)[0]
         error = (action - free).abs().amax(-1).detach()
         tolerance = 1e2 * torch.finfo(dtype).eps * example.size
         holds = ~dropped | (error <= tolerance) & log_det.isfinite()
-        at = {"latent": latent.detach(), "centre": centre}
+        at = {"latent": latent.detach(), "anchor": anchor}
         expected = "no influence of a dropped set"
         require(sets, method, holds, expected, "an action off by", error, **at)
         finite = gradient.isfinite().all(-1) | ~dropped

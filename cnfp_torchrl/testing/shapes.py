@@ -13,7 +13,7 @@ from cnfp_torchrl.geometry import ConstraintSet, GeometryError
 from cnfp_torchrl.testing.family_error import FamilyError, called, shown
 
 
-def check_event_dims(sets: ConstraintSet, centre: Tensor) -> None:
+def check_event_dims(sets: ConstraintSet, anchor: Tensor) -> None:
     """`event_dims` maps each field to its number of event dimensions, and fits the example."""
     family = type(sets)
     fields = [each.name for each in dataclasses.fields(sets)]
@@ -34,33 +34,33 @@ def check_event_dims(sets: ConstraintSet, centre: Tensor) -> None:
         raise FamilyError(
             family, "event_dims", f"expected to fit the fields, given {dict(dims)}: {error}"
         ) from error
-    if sets.dtype != centre.dtype:
+    if sets.dtype != anchor.dtype:
         raise ValueError(
-            f"centre: expected the dtype of the sets, {sets.dtype}, given {centre.dtype}"
+            f"anchor: expected the dtype of the sets, {sets.dtype}, given {anchor.dtype}"
         )
-    if sets.dim != centre.shape[-1]:
+    if sets.dim != anchor.shape[-1]:
         raise FamilyError(
             family,
             "event_dims",
-            f"expected the centre's action dimension, {centre.shape[-1]}, given {sets.dim}, the "
+            f"expected the anchor's action dimension, {anchor.shape[-1]}, given {sets.dim}, the "
             "last size of the first field with event dimensions",
         )
     try:
-        torch.broadcast_shapes(sets.batch_shape, centre.shape[:-1])
+        torch.broadcast_shapes(sets.batch_shape, anchor.shape[:-1])
     except RuntimeError:
         shapes = {name: tuple(field.shape) for name, field in sets.fields().items()}
         raise FamilyError(
             family,
             "event_dims",
-            f"expected a batch shape that broadcasts with the centre's, {tuple(centre.shape[:-1])},"
+            f"expected a batch shape that broadcasts with the anchor's, {tuple(anchor.shape[:-1])},"
             f" given {tuple(sets.batch_shape)}, from fields {shapes} and {dict(dims)}",
         ) from None
 
 
-def check_violations(sets: ConstraintSet, centre: Tensor) -> None:
+def check_invalid_fields(sets: ConstraintSet, anchor: Tensor) -> None:
     """`violations` yields (field, boolean mask, words), and finds none in the example."""
     family = type(sets)
-    for rule in called(family, "violations", lambda: list(sets.violations())):
+    for rule in called(family, "violations", lambda: list(sets.invalid_fields())):
         if not (isinstance(rule, tuple) and len(rule) == 3 and rule[0] in sets.event_dims):
             raise FamilyError(
                 family,
@@ -81,10 +81,10 @@ def check_violations(sets: ConstraintSet, centre: Tensor) -> None:
         ) from error
 
 
-def check_output_shapes(sets: ConstraintSet, centre: Tensor) -> None:
+def check_output_shapes(sets: ConstraintSet, anchor: Tensor) -> None:
     """Results have the shape (*sample, *batch), sets the fields' event shapes, all one dtype."""
-    batch = torch.broadcast_shapes(sets.batch_shape, centre.shape[:-1])
-    whole = centre.expand(*batch, -1)
+    batch = torch.broadcast_shapes(sets.batch_shape, anchor.shape[:-1])
+    whole = anchor.expand(*batch, -1)
     ones = torch.ones_like(whole)
     for sample in ((), (3,), (5, 4)):
         action, way = (each.expand(*sample, *whole.shape) for each in (whole, ones))
@@ -102,11 +102,11 @@ def check_output_shapes(sets: ConstraintSet, centre: Tensor) -> None:
         _check_tensor(sets, "bounding_box", wide, whole.shape, sets.dtype)
 
 
-def check_batches(sets: ConstraintSet, centre: Tensor) -> None:
+def check_batches(sets: ConstraintSet, anchor: Tensor) -> None:
     """Batch elements do not mix, and fields of different batch shapes broadcast."""
-    batch = torch.broadcast_shapes(sets.batch_shape, centre.shape[:-1])
-    index = torch.arange(batch.numel(), device=centre.device)
-    flat, at = sets.select(batch, index), centre.expand(*batch, -1).reshape(-1, centre.shape[-1])
+    batch = torch.broadcast_shapes(sets.batch_shape, anchor.shape[:-1])
+    index = torch.arange(batch.numel(), device=anchor.device)
+    flat, at = sets.select(batch, index), anchor.expand(*batch, -1).reshape(-1, anchor.shape[-1])
     way = at + torch.linspace(-1, 2, at.shape[-1], dtype=at.dtype, device=at.device)
     action = at + 0.1 * way
     calls = _calls(flat, action, way, at)
@@ -131,13 +131,13 @@ def check_batches(sets: ConstraintSet, centre: Tensor) -> None:
 
 
 def _calls(
-    sets: ConstraintSet, action: Tensor, way: Tensor, centre: Tensor
+    sets: ConstraintSet, action: Tensor, way: Tensor, anchor: Tensor
 ) -> dict[str, Callable[[], Tensor]]:
     return {
         "slack": partial(sets.slack, action),
         "contains": partial(sets.contains, action),
-        "gauge": partial(sets.gauge, way, centre),
-        "gauge_about": lambda: sets.gauge_about(centre)(way),
+        "gauge": partial(sets.gauge, way, anchor),
+        "gauge_about": lambda: sets.gauge_about(anchor)(way),
     }
 
 

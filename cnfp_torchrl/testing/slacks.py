@@ -1,4 +1,4 @@
-"""Checks of slack, containment, and what the search for centres knows of a family."""
+"""Checks of slack, containment, and what the search for anchors knows of a family."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cnfp_torchrl.geometry import (
     KinkedSum,
     Rows,
     Superlevel,
-    lexicographic_centre,
+    lexicographic_anchor,
 )
 from cnfp_torchrl.testing.example import Example
 from cnfp_torchrl.testing.family_error import FamilyError, called, require
@@ -23,21 +23,21 @@ from cnfp_torchrl.testing.family_error import FamilyError, called, require
 _COUNT = 200
 
 
-def check_slack_at_the_centre(example: Example) -> None:
-    """The given centre has a positive slack and is contained."""
-    centre = example.views[0].centre
-    slack = example.sets.slack(centre)
-    expected = "a positive slack at the given centre (or a centre inside the set)"
-    require(example.sets, "slack", slack > 0, expected, "a slack of", slack, centre=centre)
-    inside = example.sets.contains(centre)
+def check_slack_at_the_anchor(example: Example) -> None:
+    """The given anchor has a positive slack and is contained."""
+    anchor = example.views[0].anchor
+    slack = example.sets.slack(anchor)
+    expected = "a positive slack at the given anchor (or an anchor inside the set)"
+    require(example.sets, "slack", slack > 0, expected, "a slack of", slack, anchor=anchor)
+    inside = example.sets.contains(anchor)
     require(
         example.sets,
         "contains",
         inside,
-        "the given centre inside",
+        "the given anchor inside",
         "a slack of",
         slack,
-        centre=centre,
+        anchor=anchor,
     )
 
 
@@ -86,14 +86,14 @@ def check_slack_is_concave(example: Example) -> None:
         "slack",
         holds,
         "a concave function, at least the chord's value between two actions; otherwise the search "
-        "for centres drops sets that hold (if the set is not convex, state superlevel and "
+        "for anchors drops sets that hold (if the set is not convex, state superlevel and "
         "part_near)",
         "a difference of",
         slack - chord,
         one_action=one,
         other_action=other,
     )
-    at = torch.cat([one, example.views[0].centre.unsqueeze(0)]).requires_grad_()
+    at = torch.cat([one, example.views[0].anchor.unsqueeze(0)]).requires_grad_()
     value = sets.slack(at)
     (gradient,) = torch.autograd.grad(value.sum(), at)
     ahead = torch.cat([other, example.actions(1)]) - at.detach()
@@ -103,7 +103,7 @@ def check_slack_is_concave(example: Example) -> None:
         sets,
         "slack",
         excess <= _tolerance(example, value.detach()),
-        "a finite gradient whose linearisation lies above the slack everywhere",
+        "a finite gradient whose linearization lies above the slack everywhere",
         "a slack that exceeds it by",
         excess,
         action=at.detach(),
@@ -152,15 +152,15 @@ def _check_part(example: Example, method: str, part: object, action: Tensor) -> 
 
 
 def check_search_keeps_the_set(example: Example) -> None:
-    """The search for centres keeps the set wherever the given centre has slack enough."""
-    sets, bounds, centre = example.sets, example.bounds, example.views[0].centre
+    """The search for anchors keeps the set wherever the given anchor has slack enough."""
+    sets, bounds, anchor = example.sets, example.bounds, example.views[0].anchor
     method = "slack" if sets.superlevel() is None else "superlevel"
     twice = [each.eroded(example.size).eroded(example.size) for each in (bounds, sets)]
-    slack = torch.minimum(*(each.slack(centre) for each in twice))
-    _, active = called(type(sets), method, lambda: lexicographic_centre([bounds, sets]))
+    slack = torch.minimum(*(each.slack(anchor) for each in twice))
+    _, active = called(type(sets), method, lambda: lexicographic_anchor([bounds, sets]))
     kept = active[..., 1] | (slack < 2 * MINIMUM_SLACK)
-    expected = "the search for centres to keep the set wherever a centre has slack enough"
-    require(sets, method, kept, expected, "a slack of", slack, centre=centre)
+    expected = "the search for anchors to keep the set wherever an anchor has slack enough"
+    require(sets, method, kept, expected, "a slack of", slack, anchor=anchor)
 
 
 def check_bounding_box(example: Example) -> None:
@@ -168,7 +168,7 @@ def check_bounding_box(example: Example) -> None:
     box = example.sets.bounding_box()
     points = [example.actions(5 * _COUNT)]
     for view in example.views:
-        points.append(view.at(example.sets.gauge(view.ways, view.centre).clamp(min=1)))
+        points.append(view.at(example.sets.gauge(view.ways, view.anchor).clamp(min=1)))
     action = torch.cat(points)
     outside = example.sets.slack(action) < 0
     slack = box.slack(action)
@@ -181,7 +181,7 @@ def check_contains_is_exact(example: Example) -> None:
     """`contains` judges float32 actions at the boundary by float64 arithmetic."""
     sets = example.cast(torch.float32)[1]
     for view in example.views:
-        gauge = example.sets.gauge(view.ways, view.centre).clamp(min=0.25)
+        gauge = example.sets.gauge(view.ways, view.anchor).clamp(min=0.25)
         ulps = 4 * (example.uniform(*view.ways.shape) - 0.5) * torch.finfo(torch.float32).eps
         action = (view.at(gauge) * (1 + ulps)).float()
         slack = example.sets.slack(action.double())

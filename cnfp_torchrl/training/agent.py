@@ -21,7 +21,7 @@ def build_environment(
     config: DictConfig,
     *,
     batch_size: list[int] | None = None,
-    with_centre: bool = False,
+    with_anchor: bool = False,
     with_penalty: bool = False,
 ) -> TransformedEnv:
     """Return the environment of a configuration.
@@ -29,7 +29,7 @@ def build_environment(
     Args:
         config: with sections ``env`` and ``flow``.
         batch_size: replaces the batch size of environments that have one.
-        with_centre: publish centre and active flags also where the flow does not need them.
+        with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
 
@@ -45,7 +45,7 @@ def build_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
         {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
         order=list(config.flow.order),
-        with_centre=with_centre or flow.is_exact,
+        with_anchor=with_anchor or flow.is_safe,
         penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
     )
 

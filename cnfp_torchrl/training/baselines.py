@@ -8,8 +8,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.rays import scaled_direction
-from cnfp_torchrl.envs import Layout, ShortestPath
 from cnfp_torchrl.modules import ConstrainedFlowModule
+from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
 
 
 class StandStill(TensorDictModuleBase):
@@ -57,8 +57,8 @@ class ShortestPathPolicy(TensorDictModuleBase):
 
     def _push_inside(self, tensordict: TensorDictBase, wish: Tensor) -> Tensor:
         region = self.head.get_region(tensordict).eroded()
-        offset = wish - region.centre
+        offset = wish - region.anchor
         direction, _ = scaled_direction(offset)
         _, gauge = region.outer_and_inner_gauge(direction)
         depth = offset.abs().amax(-1) * gauge
-        return region.centre + offset / depth.clamp(min=1).unsqueeze(-1)
+        return region.anchor + offset / depth.clamp(min=1).unsqueeze(-1)

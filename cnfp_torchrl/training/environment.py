@@ -1,4 +1,4 @@
-"""Assembly of an environment from its base, its geometry transforms and the centre."""
+"""Assembly of an environment from its base, its geometry transforms and the anchor."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 
 from cnfp_torchrl.envs import (
-    ConstraintCentre,
+    ConstraintAnchor,
     GeometryTransform,
     RewardPenalty,
     constraint_bijectors,
@@ -20,7 +20,7 @@ def make_environment(
     geometries: Mapping[str, GeometryTransform],
     *,
     order: Sequence[str],
-    with_centre: bool,
+    with_anchor: bool,
     penalty: RewardPenalty | None = None,
 ) -> TransformedEnv:
     """Return the environment whose states carry the constraints' geometry.
@@ -29,7 +29,7 @@ def make_environment(
         base: the environment; if it counts violations, ``constraint_names`` names its costs.
         geometries: one transform for each constraint, by its name.
         order: the constraints' names in order of application.
-        with_centre: also publish centre and active flags, which exact flows need.
+        with_anchor: also publish anchor and active flags, which exact flows need.
         penalty: what violations cost; ``episode_reward`` sums the reward without it.
 
     Raises:
@@ -44,9 +44,9 @@ def make_environment(
     env = TransformedEnv(base, Compose(*geometries.values(), RewardSum()), auto_unwrap=True)
     if penalty is not None:
         env.append_transform(penalty)
-    if with_centre:
+    if with_anchor:
         bijectors = constraint_bijectors(env) if geometries else []
-        env.append_transform(ConstraintCentre(bijectors, order))
+        env.append_transform(ConstraintAnchor(bijectors, order))
     return env
 
 

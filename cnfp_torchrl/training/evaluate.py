@@ -35,7 +35,7 @@ def evaluate_run(
         trusted: see `RunFolder.load_config`.
     """
     config = folder.load_config(trusted)
-    env = build_environment(config, batch_size=[settings.episodes], with_centre=True)
+    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
     actor = load_actor(folder, config, env)
     safe = constrain(actor, flow="exact")
     exact = flow_head(safe)

@@ -55,7 +55,7 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     started = time.perf_counter()
     require_settings(config)
     settings: TrainingSettings = instantiate(config.training)
-    judgement: EvaluationSettings = instantiate(config.evaluation)
+    judgment: EvaluationSettings = instantiate(config.evaluation)
     require_frames(config)
     score = instantiate(config.env.get("score"))
     watch: Watch | None = instantiate(config.visual, _convert_="all") or None
@@ -123,8 +123,8 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         # Evaluation
         watched: dict[bool, EpisodeCollector] = {}
         if watch is not None:
-            watched[watch.deterministic] = EpisodeCollector(first_episodes(watch, judgement))
-        results = _evaluations(config, actor, judgement, watched)
+            watched[watch.deterministic] = EpisodeCollector(first_episodes(watch, judgment))
+        results = _evaluations(config, actor, judgment, watched)
         summary = {
             **_results(metrics, results, score),
             "steps": metrics.frames,

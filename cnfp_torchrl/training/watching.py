@@ -112,7 +112,7 @@ def watch_run(
         trusted: see `RunFolder.load_config`.
     """
     config = folder.load_config(trusted)
-    env = build_environment(config, batch_size=[settings.episodes], with_centre=True)
+    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
     actor = load_actor(folder, config, env)
     watcher = watch.of_episodes(recording, actor, env)
     try:
@@ -140,7 +140,7 @@ def replay_episodes(
     """Return the transitions of some episodes of an evaluation, each of batch size ``()``.
 
     Args:
-        env: of the evaluation's batch size, with centre and active flags.
+        env: of the evaluation's batch size, with anchor and active flags.
         actor: the trained one.
         settings: of the evaluation.
         wanted: the episodes' numbers, from 0.

@@ -1,6 +1,6 @@
 """Pictures of flow policies and of runs, drawn with matplotlib and without a window."""
 
-from cnfp_torchrl.visual.colours import constraint_colours
+from cnfp_torchrl.visual.colors import constraint_colors
 from cnfp_torchrl.visual.flow_stages import flow_stages
 from cnfp_torchrl.visual.learning_curves import learning_curves, read_scalars
 from cnfp_torchrl.visual.run_figures import draw_run_figures
@@ -12,7 +12,7 @@ __all__ = [
     "Episode",
     "FlowSnapshot",
     "Stage",
-    "constraint_colours",
+    "constraint_colors",
     "draw_run_figures",
     "flow_stages",
     "learning_curves",

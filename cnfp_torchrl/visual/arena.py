@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import Layout
-from cnfp_torchrl.visual.colours import GOAL, INK, RECTANGLE, STATION, ZONE
+from cnfp_torchrl.tasks.point_nav import Layout
+from cnfp_torchrl.visual.colors import GOAL, INK, RECTANGLE, STATION, ZONE
 
 Point = tuple[float, float]
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from cnfp_torchrl.training.audit.report import (
+from cnfp_torchrl.audit.report import (
     TOGETHER,
     AuditReport,
     Findings,
@@ -23,7 +23,7 @@ from cnfp_torchrl.training.audit.report import (
     Share,
 )
 from cnfp_torchrl.visual.canvas import house_style, new_figure, save_png
-from cnfp_torchrl.visual.colours import INK, MUTED, constraint_colours
+from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
 from cnfp_torchrl.visual.outlines import region_outline, set_outline
 
 _FLAW = "#B80F0A"
@@ -48,23 +48,23 @@ def audit_figure(report: AuditReport) -> Figure:
     set: every action tried there.
 
     Args:
-        report: of `cnfp_torchrl.training.audit.audit`.
+        report: of `cnfp_torchrl.audit.audit`.
     """
-    colours = constraint_colours(report.order) | {TOGETHER: INK}
+    colors = constraint_colors(report.order) | {TOGETHER: INK}
     scenes = [scene for scene in report.scenes if scene.actions.shape[-1] == 2][:_MOST_SCENES]
     with house_style():
         figure = new_figure(13.0, 7.4 if scenes else 3.4)
         verdict = f"{len(report.flaws)} flaws" if report.flaws else "no flaw found"
         figure.suptitle(f"Audit of {report.subject['environment']}: {verdict}")
         upper, *lower = figure.subfigures(2 if scenes else 1, 1, squeeze=False)[:, 0]
-        _draw_numbers(upper.subplots(1, 4), report, colours)
+        _draw_numbers(upper.subplots(1, 4), report, colors)
         upper.legend(
             handles=_source_entries(list(report.sources)), loc="outside lower center", ncols=2
         )
         for part in lower:
             *panels, remarks = part.subplots(1, len(scenes) + 1, squeeze=False)[0]
             for axes, scene in zip(panels, scenes, strict=True):
-                _draw_scene(axes, scene, report.order, colours)
+                _draw_scene(axes, scene, report.order, colors)
             _write_remarks(remarks, report)
     return figure
 
@@ -74,7 +74,7 @@ def save_audit(report: AuditReport, path: Path) -> Path:
     return save_png(audit_figure(report), path)
 
 
-def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colours: Mapping[str, str]) -> None:
+def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[str, str]) -> None:
     names = [*report.order, TOGETHER]
     titles = (
         "unsound\n% of actions in the set",
@@ -93,7 +93,7 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colours: Mapping[
     for i, findings in enumerate(report.sources.values()):
         for each in findings:
             at = names.index(each.name) + (i - (len(report.sources) - 1) / 2) * height
-            _draw_findings(panels, each, at, 0.85 * height, colours[each.name], faint=i > 0)
+            _draw_findings(panels, each, at, 0.85 * height, colors[each.name], faint=i > 0)
     for axes in panels[1:]:
         axes.set_xlim(0, 104)
     # Room for the counts beside the bars.
@@ -101,12 +101,12 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colours: Mapping[
 
 
 def _draw_findings(
-    panels: Sequence[Axes], found: Findings, at: float, height: float, colour: str, *, faint: bool
+    panels: Sequence[Axes], found: Findings, at: float, height: float, color: str, *, faint: bool
 ) -> None:
     shares = (found.unsound, found.coverage, found.dropped)
     for axes, share in zip(panels, shares, strict=False):
-        _draw_share(axes, share, at, height, colour, faint=faint, told=axes is panels[0])
-    _draw_spread(panels[3], found.volume, at, height, colour, faint=faint)
+        _draw_share(axes, share, at, height, color, faint=faint, told=axes is panels[0])
+    _draw_spread(panels[3], found.volume, at, height, color, faint=faint)
 
 
 def _draw_share(
@@ -114,7 +114,7 @@ def _draw_share(
     share: Share | None,
     at: float,
     height: float,
-    colour: str,
+    color: str,
     *,
     faint: bool,
     told: bool,
@@ -124,7 +124,7 @@ def _draw_share(
         axes.annotate(said, (0, at), (3, 0), textcoords="offset points", va="center", color=MUTED)
         return
     percent = 100 * share.share
-    axes.barh(at, percent, height, color=colour, alpha=0.4 if faint else 0.9, zorder=2)
+    axes.barh(at, percent, height, color=color, alpha=0.4 if faint else 0.9, zorder=2)
     if told:
         said = f"{share.count:,} of {share.of:,}"
         axes.annotate(
@@ -136,7 +136,7 @@ def _draw_share(
 
 
 def _draw_spread(
-    axes: Axes, found: Quantiles, at: float, height: float, colour: str, *, faint: bool
+    axes: Axes, found: Quantiles, at: float, height: float, color: str, *, faint: bool
 ) -> None:
     """Draw a line over all states, a box over the middle 90 % and a mark at the median."""
     if found["median"] is None:
@@ -144,12 +144,12 @@ def _draw_spread(
     low, high, least, most, middle = (
         100 * (found[name] or 0.0) for name in ("q05", "q95", "min", "max", "median")
     )
-    axes.plot([least, most], [at, at], color=colour, linewidth=1, zorder=2)
-    axes.barh(at, high - low, height, left=low, color=colour, alpha=0.4 if faint else 0.9, zorder=2)
+    axes.plot([least, most], [at, at], color=color, linewidth=1, zorder=2)
+    axes.barh(at, high - low, height, left=low, color=color, alpha=0.4 if faint else 0.9, zorder=2)
     axes.plot(middle, at, "D", color="white", mec=INK, mew=0.8, markersize=4, zorder=3)
 
 
-def _draw_scene(axes: Axes, scene: Scene, order: Sequence[str], colours: Mapping[str, str]) -> None:
+def _draw_scene(axes: Axes, scene: Scene, order: Sequence[str], colors: Mapping[str, str]) -> None:
     x, y = scene.actions.T.numpy()
     for depth, (mask, mark) in enumerate(zip(_kinds(scene), _MARKS.values(), strict=True)):
         axes.plot(x[mask], y[mask], linestyle="none", zorder=2 if depth < 3 else 7, **mark)
@@ -161,7 +161,7 @@ def _draw_scene(axes: Axes, scene: Scene, order: Sequence[str], colours: Mapping
         for line in set_outline(scene.region.sets[k], view):
             width = 2.4 if name == scene.name else 1.3
             dashes = "-" if active else (0, (1.2, 1.8))
-            axes.plot(*line.T, color=colours[name], linewidth=width, linestyle=dashes, zorder=5)
+            axes.plot(*line.T, color=colors[name], linewidth=width, linestyle=dashes, zorder=5)
     edge = region_outline(scene.region, range(len(scene.region.sets)))
     axes.plot(*edge.T, color=INK, linewidth=1.0, zorder=6)
     axes.set_xlim(view[0], view[1])

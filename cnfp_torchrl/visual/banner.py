@@ -12,9 +12,9 @@ from matplotlib.patches import FancyArrowPatch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.envs import Layout
+from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.visual.canvas import house_style
-from cnfp_torchrl.visual.colours import INK, MUTED, constraint_colours
+from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
 from cnfp_torchrl.visual.density import (
     CURVE,
     SPREAD,
@@ -36,7 +36,7 @@ _COUNTED = 1_000_000
 
 
 def flow_banner(
-    snapshot: FlowSnapshot, layout: Layout, *, colours: Mapping[str, str] | None = None
+    snapshot: FlowSnapshot, layout: Layout, *, colors: Mapping[str, str] | None = None
 ) -> Figure:
     """Draw state, base and stages of an exact flow in one row, with arrows between them.
 
@@ -45,15 +45,15 @@ def flow_banner(
     Args:
         snapshot: of an exact flow with two action components, in a state of point navigation.
         layout: its map.
-        colours: of the constraints; None chooses them by name.
+        colors: of the constraints; None chooses them by name.
     """
-    colours = dict(colours or constraint_colours(snapshot.constraint_names))
+    colors = dict(colors or constraint_colors(snapshot.constraint_names))
     scale, grids = density_scale(snapshot), stage_grids(snapshot)
     assert grids is not None
     with house_style():
         figure = Figure(figsize=_SIZE)
         panels = [_panel(figure, i) for i in range(2 + len(snapshot.stages))]
-        draw_moves(panels[0], snapshot, layout, colours)
+        draw_moves(panels[0], snapshot, layout, colors)
         panels[0].set(xticks=[], yticks=[], xlabel="", ylabel="", title="")
         _zoom(panels[0], snapshot, layout)
         _caption(panels[0], "the state", "where the agent may move")
@@ -76,10 +76,10 @@ def flow_banner(
             index = stage.applied[-1]
             if index > 0:
                 for line in set_outline(snapshot.region.sets[index], _VIEW):
-                    panel.plot(*line.T, color=colours[stage.name], linewidth=2.6, zorder=5)
+                    panel.plot(*line.T, color=colors[stage.name], linewidth=2.6, zorder=5)
             panel.plot(*region_outline(snapshot.region, stage.applied).T, color=INK, lw=1, zorder=6)
             panel.set(xlim=_VIEW[:2], ylim=_VIEW[2:])
-            _caption(panel, *_stage_words(snapshot, i), colour=colours.get(stage.name, INK))
+            _caption(panel, *_stage_words(snapshot, i), color=colors.get(stage.name, INK))
         for i, word in enumerate(["", "tanh", *["retract"] * (len(panels) - 3)]):
             _arrow(figure, i, word)
         figure.text(
@@ -145,10 +145,10 @@ def _panel(figure: Figure, column: int) -> Axes:
     return axes
 
 
-def _caption(axes: Axes, head: str, words: str, *, colour: str = INK) -> None:
+def _caption(axes: Axes, head: str, words: str, *, color: str = INK) -> None:
     axes.text(
         0.5, 1.07, head, transform=axes.transAxes, ha="center", va="center", fontsize=12,
-        fontweight="bold", color=colour,
+        fontweight="bold", color=color,
     )  # fmt: skip
     axes.text(0.5, -0.09, words, transform=axes.transAxes, ha="center", va="center", fontsize=10)
 

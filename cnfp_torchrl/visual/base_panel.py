@@ -27,7 +27,7 @@ def draw_base(axes: Axes, snapshot: FlowSnapshot, scale: Normalize) -> None:
     Args:
         axes: an empty panel.
         snapshot: the policy in a state.
-        scale: of the log-density's colours.
+        scale: of the log-density's colors.
     """
     if snapshot.dim == 1:
         _draw_curve(axes, snapshot)

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
-from cnfp_torchrl.visual.colours import FAINT, INK, MUTED
+from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
 
 _STYLE: dict[RcKeyType, Any] = {
     "font.family": "DejaVu Sans",

@@ -1,4 +1,4 @@
-"""The density of a flow policy: over a grid of base samples, and its colours."""
+"""The density of a flow policy: over a grid of base samples, and its colors."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from torch import Tensor
 
-from cnfp_torchrl.visual.colours import INK, MUTED
+from cnfp_torchrl.visual.colors import INK, MUTED
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
-COLOURS = LinearSegmentedColormap.from_list(
+COLORS = LinearSegmentedColormap.from_list(
     "density", ["#FFFFFF", "#F0ECF8", "#DAD1EC", "#BFB0DE", "#A18ECE", "#8570BC"]
 )
 """White where rare, and light enough for samples and outlines to stand out everywhere."""
@@ -46,12 +46,12 @@ def grid_latents(snapshot: FlowSnapshot) -> Tensor:
 def base_log_density(snapshot: FlowSnapshot, latents: Tensor) -> Tensor:
     """Return the Gaussian base's log-density at latents ``(*batch, d)``."""
     standard = (latents - snapshot.loc) / snapshot.scale
-    normaliser = snapshot.scale.log() + 0.5 * math.log(2 * math.pi)
-    return -(standard.square() / 2 + normaliser).sum(-1)
+    normalizer = snapshot.scale.log() + 0.5 * math.log(2 * math.pi)
+    return -(standard.square() / 2 + normalizer).sum(-1)
 
 
 def density_scale(snapshot: FlowSnapshot) -> Normalize:
-    """Return one colour scale for base and stages, from the bulk of the samples' log-densities."""
+    """Return one color scale for base and stages, from the bulk of the samples' log-densities."""
     drawn = [snapshot.latent_log_density, *(stage.log_density for stage in snapshot.stages)]
     values = torch.cat(drawn).double()
     values = values[values.isfinite()]
@@ -63,14 +63,14 @@ def density_scale(snapshot: FlowSnapshot) -> Normalize:
 
 
 def draw_grid(axes: Axes, points: Tensor, log_density: Tensor, scale: Normalize) -> None:
-    """Colour a bent grid of points ``(rows, columns, 2)`` by the log-density at its nodes."""
+    """Color a bent grid of points ``(rows, columns, 2)`` by the log-density at its nodes."""
     x, y = points.numpy()[..., 0], points.numpy()[..., 1]
     values = np.clip(log_density.nan_to_num(neginf=-1e6).numpy(), scale.vmin, scale.vmax)
-    axes.pcolormesh(x, y, values, cmap=COLOURS, norm=scale, shading="gouraud", zorder=1)
+    axes.pcolormesh(x, y, values, cmap=COLORS, norm=scale, shading="gouraud", zorder=1)
 
 
 def draw_samples(axes: Axes, samples: Tensor, broken: Tensor | None = None) -> None:
-    """Draw samples ``(n, 2)`` as dots, those that are broken in a colour of warning."""
+    """Draw samples ``(n, 2)`` as dots, those that are broken in a color of warning."""
     broken = torch.zeros(len(samples), dtype=torch.bool) if broken is None else broken
     good, bad = samples[~broken].numpy(), samples[broken].numpy()
     axes.plot(*good.T, ".", color=INK, markersize=2.4, alpha=0.7, mew=0, zorder=3, label="samples")
@@ -82,17 +82,17 @@ def draw_samples(axes: Axes, samples: Tensor, broken: Tensor | None = None) -> N
 def draw_scored_samples(
     axes: Axes, samples: Tensor, log_density: Tensor, scale: Normalize, broken: Tensor | None = None
 ) -> None:
-    """Draw samples ``(n, 2)`` coloured by their log-density ``(n,)``."""
+    """Draw samples ``(n, 2)`` colored by their log-density ``(n,)``."""
     broken = torch.zeros(len(samples), dtype=torch.bool) if broken is None else broken
     x, y = samples[~broken].numpy().T
-    colours = COLOURS(scale(log_density[~broken].numpy()))
-    axes.scatter(x, y, c=colours, s=8, linewidths=0.3, edgecolors=MUTED, zorder=3)
+    colors = COLORS(scale(log_density[~broken].numpy()))
+    axes.scatter(x, y, c=colors, s=8, linewidths=0.3, edgecolors=MUTED, zorder=3)
     axes.plot(*samples[broken].numpy().T, ".", color=BREAKS, markersize=4, mew=0, zorder=3)
 
 
 def draw_rug(axes: Axes, samples: Tensor, level: float, broken: Tensor | None = None) -> None:
     """Draw samples ``(n, 1)`` of one component as ticks at a level."""
     broken = torch.zeros(len(samples), dtype=torch.bool) if broken is None else broken
-    for chosen, colour in ((~broken, INK), (broken, BREAKS)):
+    for chosen, color in ((~broken, INK), (broken, BREAKS)):
         at = samples[chosen, 0].numpy()
-        axes.plot(at, np.full_like(at, level), "|", color=colour, markersize=5, alpha=0.15)
+        axes.plot(at, np.full_like(at, level), "|", color=color, markersize=5, alpha=0.15)

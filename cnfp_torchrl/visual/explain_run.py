@@ -59,7 +59,7 @@ def explain_run(
         )
     if step < 0:
         raise ValueError(f"--step: expected a number >= 0, given {step}")
-    env = build_environment(config, batch_size=[settings.episodes], with_centre=True)
+    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
     actor = load_actor(folder, config, env)
     if not flow_head(actor).flow.has_density:
         raise ValueError(

@@ -59,7 +59,7 @@ def explain(
         share_allowed=None if allowed is None else _share(allowed[kept].all(0)),
         samples=len(snapshot.latents),
         situation=situation,
-        is_exact=snapshot.is_exact,
+        is_safe=snapshot.is_safe,
     )
 
 
@@ -77,7 +77,7 @@ def _effect(
     if stage is not None and path is not None:
         after = path[stage]
         before = path[stage - 1] if stage else snapshot.latents[snapshot.followed].to(after)
-    if stage and snapshot.is_exact:
+    if stage and snapshot.is_safe:
         size = float(vector_norm(snapshot.region.bounds.high - snapshot.region.bounds.low))
         ways = snapshot.stages[stage].samples - snapshot.stages[stage - 1].samples
         share_moved = _share(vector_norm(ways, dim=-1) > _VISIBLE * size)
@@ -85,11 +85,11 @@ def _effect(
             way = float(vector_norm(after - before))
             moved = way if way > _VISIBLE * size else 0.0
     effect: Effect = "restrictive"
-    if snapshot.is_exact and not snapshot.is_active(index):
+    if snapshot.is_safe and not snapshot.is_active(index):
         effect = "dropped"
     elif not bool(contained[snapshot.followed]):
         effect = "broken"
-    elif (share_moved == 0 and not moved) if snapshot.is_exact else share_allowed == 1:
+    elif (share_moved == 0 and not moved) if snapshot.is_safe else share_allowed == 1:
         effect = "permissive"
     return ConstraintEffect(
         name=snapshot.constraint_names[index - 1],

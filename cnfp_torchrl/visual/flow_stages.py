@@ -11,12 +11,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cnfp_torchrl.envs import Layout
+from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.visual.arena import agent_entry, goal_entry
 from cnfp_torchrl.visual.base_panel import draw_base
 from cnfp_torchrl.visual.canvas import house_style, new_figure
-from cnfp_torchrl.visual.colours import INK, MUTED, constraint_colours
-from cnfp_torchrl.visual.density import BREAKS, COLOURS, density_scale, grid_latents
+from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
+from cnfp_torchrl.visual.density import BREAKS, COLORS, density_scale, grid_latents
 from cnfp_torchrl.visual.map_panel import draw_moves
 from cnfp_torchrl.visual.outlines import View
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
@@ -29,7 +29,7 @@ def flow_stages(
     snapshot: FlowSnapshot,
     *,
     layout: Layout | None = None,
-    colours: Mapping[str, str] | None = None,
+    colors: Mapping[str, str] | None = None,
     title: str = "Flow stages",
 ) -> Figure:
     """Draw a flow policy in one state, its stages in order of application.
@@ -41,13 +41,13 @@ def flow_stages(
     Args:
         snapshot: the policy in the state.
         layout: the map, for states of point navigation; None leaves its panel out.
-        colours: of the constraints; None chooses them by name.
+        colors: of the constraints; None chooses them by name.
         title: above the panels.
     """
-    colours = dict(colours or constraint_colours(snapshot.constraint_names))
+    colors = dict(colors or constraint_colors(snapshot.constraint_names))
     grids = stage_grids(snapshot)
     view = _view(snapshot)
-    style = PanelStyle(view, density_scale(snapshot), colours, set_outlines(snapshot, view))
+    style = PanelStyle(view, density_scale(snapshot), colors, set_outlines(snapshot, view))
     first = 0 if layout is None else 1
     panels = first + 1 + len(snapshot.stages)
     rows = -(-panels // _COLUMNS)
@@ -59,7 +59,7 @@ def flow_stages(
         figure.suptitle(title)
         axes = [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
         if layout is not None:
-            draw_moves(axes[0], snapshot, layout, colours)
+            draw_moves(axes[0], snapshot, layout, colors)
         draw_base(axes[first], snapshot, style.scale)
         axes[first].set_title("base\nz ~ N(μ, σ²)")
         _name_axes(axes[first], snapshot.dim, "z", leftmost=True)
@@ -72,11 +72,11 @@ def flow_stages(
             panel.set_title(_stage_title(snapshot, i))
             _name_axes(panel, snapshot.dim, "a", leftmost=i == 0)
         if snapshot.dim > 1:
-            mapping = ScalarMappable(style.scale, COLOURS)
+            mapping = ScalarMappable(style.scale, COLORS)
             bar = figure.colorbar(mapping, ax=axes, shrink=0.75, aspect=28)
             bar.set_label("log-density (nats)")
             bar.outline.set_visible(False)
-        entries = _legend(snapshot, colours, with_map=layout is not None)
+        entries = _legend(snapshot, colors, with_map=layout is not None)
         width = 2 * columns
         figure.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), width))
     return figure
@@ -123,15 +123,15 @@ def _stage_title(snapshot: FlowSnapshot, index: int) -> str:
     name = "action bounds" if stage.applied[-1] == 0 else stage.name
     head = f"stage {index + 1}: {name}"
     if not stage.active:
-        head += " (dropped here)" if snapshot.is_exact else " (cannot hold here)"
+        head += " (dropped here)" if snapshot.is_safe else " (cannot hold here)"
     said = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
     return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {said}"
 
 
-def _legend(snapshot: FlowSnapshot, colours: Mapping[str, str], *, with_map: bool) -> list[Line2D]:
+def _legend(snapshot: FlowSnapshot, colors: Mapping[str, str], *, with_map: bool) -> list[Line2D]:
     entries = [agent_entry(), goal_entry("goal", reached=False)] if with_map else []
     entries += [
-        Line2D([], [], color=colours[name], linewidth=2.4, label=f"{name} set")
+        Line2D([], [], color=colors[name], linewidth=2.4, label=f"{name} set")
         for name in snapshot.constraint_names
     ]
     entries += [

@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from cnfp_torchrl.visual.canvas import house_style, message_figure, new_figure, say
-from cnfp_torchrl.visual.colours import INK, MUTED, constraint_colours
+from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
 
 Curve: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Steps and values."""
@@ -53,7 +53,7 @@ def read_scalars(metrics: Path) -> dict[str, Curve]:
 def learning_curves(
     curves: Mapping[str, Curve],
     *,
-    colours: Mapping[str, str] | None = None,
+    colors: Mapping[str, str] | None = None,
     title: str = "Learning curves",
 ) -> Figure:
     """Draw return, cumulative violations by constraint, and whatever else was logged of learning.
@@ -62,7 +62,7 @@ def learning_curves(
 
     Args:
         curves: steps and values by name, see `read_scalars`.
-        colours: of the constraints; None chooses them by the names found.
+        colors: of the constraints; None chooses them by the names found.
         title: above the panels.
     """
     if not curves:
@@ -86,7 +86,7 @@ def learning_curves(
         figure.suptitle(title)
         axes = [figure.add_subplot(rows, columns, 1 + i) for i in range(panels)]
         _draw_return(axes[0], curves.get(RETURN))
-        _draw_violations(axes[1], counted, dict(colours or constraint_colours(counted)))
+        _draw_violations(axes[1], counted, dict(colors or constraint_colors(counted)))
         for panel, (name, curve) in zip(axes[2:], others.items(), strict=True):
             panel.set_title(_title(name))
             _plot(panel, curve)
@@ -115,7 +115,7 @@ def _draw_return(axes: Axes, curve: Curve | None) -> None:
         _plot(axes, curve)
 
 
-def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colours: Mapping[str, str]) -> None:
+def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[str, str]) -> None:
     axes.set_title("violations since the start")
     if not counted:
         say(axes, "none counted")
@@ -124,7 +124,7 @@ def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colours: Mapping[
     widths = 1.4 + 1.4 * np.arange(len(counted))[::-1]
     for (name, (steps, values)), width in zip(counted.items(), widths, strict=True):
         label = f"{name}: {values[-1]:,.0f}"
-        axes.plot(steps, values, color=colours[name], linewidth=width, label=label)
+        axes.plot(steps, values, color=colors[name], linewidth=width, label=label)
     highest = max(float(values.max()) for _, values in counted.values())
     axes.set_ylim(-0.04 * max(highest, 1), 1.05 * max(highest, 1))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -47,7 +47,7 @@ def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> li
 
 
 def region_outline(region: Region, applied: Sequence[int]) -> Line:
-    """Return the closed boundary of the intersection of some sets, seen from the region's centre.
+    """Return the closed boundary of the intersection of some sets, seen from the region's anchor.
 
     Along each ray the boundary lies at one over the largest gauge. In more than two dimensions it
     is the boundary of the shadow that the intersection casts on the first two components.
@@ -56,11 +56,11 @@ def region_outline(region: Region, applied: Sequence[int]) -> Line:
         region: of batch shape ``()`` and dimension 2 or more.
         applied: indices into its sets; those that are not active are left out.
     """
-    rays = _RAYS if region.centre.shape[-1] == 2 else _RAYS // 2
+    rays = _RAYS if region.anchor.shape[-1] == 2 else _RAYS // 2
     angle = torch.linspace(0, 2 * torch.pi, rays + 1, dtype=torch.float64)
     ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
     gauge = shadow_gauge(region, applied, ray)
-    boundary = region.centre[:2].double() + ray / gauge.clamp(min=1 / _FAR).unsqueeze(-1)
+    boundary = region.anchor[:2].double() + ray / gauge.clamp(min=1 / _FAR).unsqueeze(-1)
     return boundary.numpy()
 
 
@@ -69,12 +69,12 @@ def interval(region: Region, applied: Sequence[int]) -> tuple[float, float]:
     ray = torch.zeros(2, 1, dtype=torch.float64)
     ray[0], ray[1] = -1, 1
     gauge = shadow_gauge(region, applied, ray).clamp(min=1 / _FAR)
-    low, high = (region.centre[0].double() + ray.squeeze(-1) / gauge).tolist()
+    low, high = (region.anchor[0].double() + ray.squeeze(-1) / gauge).tolist()
     return low, high
 
 
 def shadow_gauge(region: Region, applied: Sequence[int], ray: Tensor) -> Tensor:
-    """Return the gauge, about the region's centre, of an intersection's shadow on the first axes.
+    """Return the gauge, about the region's anchor, of an intersection's shadow on the first axes.
 
     The gauge of a projection is the least gauge over the components that are projected away. Of a
     convex function, so that descent finds it; for other sets the shadow is no larger than the true
@@ -90,12 +90,12 @@ def shadow_gauge(region: Region, applied: Sequence[int], ray: Tensor) -> Tensor:
         for k in applied
         if region.active is None or bool(region.active[k])
     ]
-    centre = region.centre.double()
-    hidden = centre.shape[-1] - ray.shape[-1]
+    anchor = region.anchor.double()
+    hidden = anchor.shape[-1] - ray.shape[-1]
 
     def gauge(rest: Tensor) -> Tensor:
         direction = torch.cat([ray, rest], dim=-1)
-        each = [a_set.gauge(direction, centre) for a_set in sets]
+        each = [a_set.gauge(direction, anchor) for a_set in sets]
         return torch.stack([torch.zeros(len(ray), dtype=ray.dtype), *each]).amax(0)
 
     rest = torch.zeros(len(ray), hidden, dtype=ray.dtype)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import BijectorChain
+from cnfp_torchrl.bijectors import SquashChain
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.modules.constraint_bijector import require
@@ -56,7 +56,7 @@ def replay_step(
 def in_float64(region: Region) -> Region:
     """Return a region in float64."""
     sets = tuple(each.to(torch.float64) for each in region.sets)
-    return Region(sets, region.centre.double(), region.active, validate_args=False)
+    return Region(sets, region.anchor.double(), region.active, validate_args=False)
 
 
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
@@ -67,7 +67,7 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     latent = staged.inverse(given[None])[0][-1]
     path, log_dets = staged.forward(latent)
     path = path.squeeze(1)
-    if isinstance(staged.last, BijectorChain):
+    if isinstance(staged.last, SquashChain):
         path = _backwards(staged.last, given)
     normal = Normal(snapshot.loc.double(), snapshot.scale.double(), validate_args=False)
     latent_log_density = Independent(normal, 1, validate_args=False).log_prob(latent)
@@ -92,7 +92,7 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     )
 
 
-def _backwards(chain: BijectorChain, action: Tensor) -> Tensor:
+def _backwards(chain: SquashChain, action: Tensor) -> Tensor:
     """Return where an action was after each member of a chain, without passing through the latent.
 
     A squash before the last one may be saturated, where the latent is lost to rounding but the

@@ -18,7 +18,7 @@ from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.arena import layout_of
 from cnfp_torchrl.visual.canvas import save_png
-from cnfp_torchrl.visual.colours import constraint_colours
+from cnfp_torchrl.visual.colors import constraint_colors
 from cnfp_torchrl.visual.flow_stages import flow_stages
 from cnfp_torchrl.visual.learning_curves import learning_curves, read_scalars
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, take_snapshot
@@ -56,15 +56,15 @@ def _figures(folder: RunFolder, config: DictConfig) -> dict[str, Figure]:
     actor = load_actor(folder, config, env)
     head = flow_head(actor)
     names = list(dict.fromkeys([*head.order, *_counted(env)]))
-    colours = constraint_colours(names)
+    colors = constraint_colors(names)
     run = f"{type(head.flow).__name__}, seed {config.seed}"
     curves = learning_curves(
-        read_scalars(folder.path / METRICS), colours=colours, title=f"Learning curves · {run}"
+        read_scalars(folder.path / METRICS), colors=colors, title=f"Learning curves · {run}"
     )
     figures = {"learning_curves": curves}
     layout = layout_of(env)
     if layout is not None:
-        figures["trajectories"] = _trajectories(config, actor, colours)
+        figures["trajectories"] = _trajectories(config, actor, colors)
     if not head.flow.has_density:
         return figures  # the stages of a flow are drawn with their densities
     for kind, state in zip(("permissive", "restrictive"), telling_states(env, head), strict=True):
@@ -72,24 +72,24 @@ def _figures(folder: RunFolder, config: DictConfig) -> dict[str, Figure]:
         if kind == "restrictive":
             snapshot = snapshot.following_the_longest_path()
         title = f"{kind.capitalize()} state{_openness(snapshot)} · {run}"
-        figures[f"flow_{kind}"] = flow_stages(snapshot, layout=layout, colours=colours, title=title)
+        figures[f"flow_{kind}"] = flow_stages(snapshot, layout=layout, colors=colors, title=title)
     return figures
 
 
 def _trajectories(
-    config: DictConfig, actor: SafeProbabilisticTensorDictSequential, colours: dict[str, str]
+    config: DictConfig, actor: SafeProbabilisticTensorDictSequential, colors: dict[str, str]
 ) -> Figure:
     env = _environment(config, _EPISODES)
     layout = layout_of(env)
     assert layout is not None
     title = "Evaluation episodes of the stochastic policy"
     return trajectories(
-        layout, record_episodes(env, actor), _counted(env), colours=colours, title=title
+        layout, record_episodes(env, actor), _counted(env), colors=colors, title=title
     )
 
 
 def _environment(config: DictConfig, batch: int) -> TransformedEnv:
-    env = build_environment(config, batch_size=[batch], with_centre=True)
+    env = build_environment(config, batch_size=[batch], with_anchor=True)
     env.set_seed(config.evaluation.seed)
     return env
 

@@ -15,7 +15,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.geometry import ConstraintSet, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
-from cnfp_torchrl.modules.constraint_bijector import CENTRE_KEY
+from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY
 from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 
@@ -51,7 +51,7 @@ class FlowSnapshot:
         latents: base samples, ``(n, d)``.
         latent_log_density: ``(n,)``.
         stages: in order of application.
-        region: sets (``sets[0]`` the action bounds), centre and active flags of this state.
+        region: sets (``sets[0]`` the action bounds), anchor and active flags of this state.
         constraint_names: of ``region.sets[1:]``, in order of application.
         through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
@@ -78,9 +78,9 @@ class FlowSnapshot:
     is_recovered: bool = True
 
     @property
-    def is_exact(self) -> bool:
+    def is_safe(self) -> bool:
         """Whether the flow drops what cannot hold and keeps everything else."""
-        return self.flow.is_exact
+        return self.flow.is_safe
 
     @property
     def dim(self) -> int:
@@ -147,7 +147,7 @@ def take_snapshot(
 
     Args:
         actor: from `make_constrained_actor` or `constrain`.
-        state: of batch size ``()``, with geometry, centre and active flags; not changed.
+        state: of batch size ``()``, with geometry, anchor and active flags; not changed.
         samples: how many base samples to draw.
         seed: of those; torch's global generator is left alone.
 
@@ -173,7 +173,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
 
     Args:
         head: the flow module of the policy.
-        state: of batch size ``()``, with location, scale and geometry; where centre and active
+        state: of batch size ``()``, with location, scale and geometry; where anchor and active
             flags are missing, which only exact flows need, they are computed here.
         noise: standard Gaussian, ``(n, d)``.
     """
@@ -226,8 +226,8 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
 
 
 def _region(head: ConstrainedFlowModule, state: TensorDictBase) -> Region:
-    """Return the region of a state, whose centre only exact flows make the environment find."""
-    if state.get(CENTRE_KEY, None) is not None:
+    """Return the region of a state, whose anchor only exact flows make the environment find."""
+    if state.get(ANCHOR_KEY, None) is not None:
         return head.get_region(state)
     return Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
 
@@ -247,4 +247,4 @@ def _on_host(region: Region) -> Region:
         return each.with_fields(lambda value, _: value.cpu())
 
     active = None if region.active is None else region.active.cpu()
-    return Region(tuple(moved(each) for each in region.sets), region.centre.cpu(), active)
+    return Region(tuple(moved(each) for each in region.sets), region.anchor.cpu(), active)

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cnfp_torchrl.visual.colours import INK, MUTED
+from cnfp_torchrl.visual.colors import INK, MUTED
 from cnfp_torchrl.visual.density import (
     CURVE,
     FILL,
@@ -38,14 +38,14 @@ class PanelStyle:
 
     Args:
         view: limits of the action axes.
-        scale: of the log-density's colours.
-        colours: of the constraints.
+        scale: of the log-density's colors.
+        colors: of the constraints.
         outlines: of each of the region's sets, the action bounds first.
     """
 
     view: View
     scale: Normalize
-    colours: Mapping[str, str]
+    colors: Mapping[str, str]
     outlines: Sequence[list[Line]]
 
 
@@ -77,7 +77,7 @@ def draw_plane(
         axes: an empty panel.
         snapshot: of dimension 2 or more.
         index: of the stage.
-        grid: of `cnfp_torchrl.visual.density.grid_latents`; None colours the samples instead.
+        grid: of `cnfp_torchrl.visual.density.grid_latents`; None colors the samples instead.
         style: shared by all panels.
     """
     stage = snapshot.stages[index]
@@ -126,9 +126,9 @@ def draw_line(
             axes.plot(
                 ends, (level, level), solid_capstyle="butt", **_set_style(snapshot, index, k, style)
             )
-    for applied, colour in (((0,), MUTED), (stage.applied, INK)):
+    for applied, color in (((0,), MUTED), (stage.applied, INK)):
         for end in interval(snapshot.region, applied):
-            axes.axvline(end, color=colour, linewidth=1.0, zorder=4)
+            axes.axvline(end, color=color, linewidth=1.0, zorder=4)
     path = snapshot.path()[: index + 1].numpy()
     draw_path(axes, np.concatenate([path, np.zeros_like(path)], axis=-1))
     axes.set_xlim(style.view[0], style.view[1])
@@ -159,7 +159,7 @@ def _set_style(snapshot: FlowSnapshot, index: int, k: int, style: PanelStyle) ->
     holds = k in applied and snapshot.is_active(k)
     name = snapshot.constraint_names[k - 1]
     return {
-        "color": style.colours[name],
+        "color": style.colors[name],
         "linewidth": 2.4 if k == applied[-1] else 1.3,
         "linestyle": "-" if holds else _NOT_APPLIED,
         "label": name,

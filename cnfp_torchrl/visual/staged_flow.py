@@ -24,16 +24,16 @@ class StagedFlow:
 
     def __init__(self, flow: Flow, region: Region, applied: Sequence[Sequence[int]]) -> None:
         self._count = len(applied)
-        self._is_one = flow.is_exact and flow.has_density
+        self._is_one = flow.is_safe and flow.has_density
         self._bijectors: list[Bijector]
         if self._is_one:
             # To an exact flow, a set not yet applied is one that is not active.
             holds = torch.tensor(
                 [[k in each for k in range(len(region.sets))] for each in applied],
-                device=region.centre.device,
+                device=region.anchor.device,
             )
             active = holds if region.active is None else holds & region.active
-            stages = flow(region.bounds, region.sets[1:], region.centre, active.unsqueeze(1))
+            stages = flow(region.bounds, region.sets[1:], region.anchor, active.unsqueeze(1))
             self._bijectors = [stages]
         else:
             self._bijectors = [stage_bijector(flow, region, each) for each in applied]
@@ -77,4 +77,4 @@ def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Biject
     constraints = [k for k in applied if k > 0]
     sets = [region.sets[k] for k in constraints]
     active = None if region.active is None else region.active[..., [0, *constraints]]
-    return flow(region.bounds, sets, region.centre, active)
+    return flow(region.bounds, sets, region.anchor, active)

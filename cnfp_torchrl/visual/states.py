@@ -7,10 +7,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import Layout
-from cnfp_torchrl.envs.layout import BATTERY_FULL
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
+from cnfp_torchrl.tasks.point_nav import Layout
+from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL
 from cnfp_torchrl.visual.arena import layout_of
 
 _DIRECTIONS = 256
@@ -38,7 +38,7 @@ def telling_states(
     rectangles; any other environment is stepped at random, within the constraints.
 
     Args:
-        env: with geometry, centre and active flags; it is reset. A larger batch looks at more
+        env: with geometry, anchor and active flags; it is reset. A larger batch looks at more
             states.
         head: the flow module of an actor for it.
         steps: length of the random walk.
@@ -63,7 +63,7 @@ def telling_states(
 def openness(region: Region) -> tuple[Tensor, Tensor]:
     """Return how much of the action bounds is allowed, and how much of its edge each set makes.
 
-    Both are means over directions from the centre, so that they make sense in any dimension.
+    Both are means over directions from the anchor, so that they make sense in any dimension.
 
     Args:
         region: of batch shape ``(n,)``.
@@ -73,10 +73,10 @@ def openness(region: Region) -> tuple[Tensor, Tensor]:
         of directions in which each constraint is the one that ends the region, ``(n, K)``.
     """
     generator = torch.Generator().manual_seed(0)
-    ray = torch.randn(_DIRECTIONS, 1, region.centre.shape[-1], generator=generator)
-    ray = ray.to(region.centre)
+    ray = torch.randn(_DIRECTIONS, 1, region.anchor.shape[-1], generator=generator)
+    ray = ray.to(region.anchor)
     gauges = torch.stack(
-        torch.broadcast_tensors(*(each.gauge(ray, region.centre) for each in region.sets))
+        torch.broadcast_tensors(*(each.gauge(ray, region.anchor) for each in region.sets))
     )
     if region.active is not None:
         gauges = torch.where(region.active.movedim(-1, 0).unsqueeze(1), gauges, 0.0)

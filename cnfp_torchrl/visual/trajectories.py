@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import Layout
-from cnfp_torchrl.envs.layout import BATTERY_FULL
+from cnfp_torchrl.tasks.point_nav import Layout
+from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL
 from cnfp_torchrl.visual.arena import (
     draw_arena,
     draw_goal,
@@ -28,12 +28,12 @@ from cnfp_torchrl.visual.arena import (
     start_entry,
 )
 from cnfp_torchrl.visual.canvas import house_style, new_figure
-from cnfp_torchrl.visual.colours import INK, constraint_colours
+from cnfp_torchrl.visual.colors import INK, constraint_colors
 
-BATTERY_COLOURS = LinearSegmentedColormap.from_list(
+BATTERY_COLORS = LinearSegmentedColormap.from_list(
     "battery", ["#2B0B3F", "#8C2981", "#E8543E", "#FDB42F"]
 )
-"""Dark when empty, light when full: readable in grey and with any colour vision."""
+"""Dark when empty, light when full: readable in gray and with any color vision."""
 
 _COLUMNS = 3
 _MARKS = ("x", "+", "1", "2")
@@ -97,21 +97,21 @@ def trajectories(
     episodes: Sequence[Episode],
     constraint_names: Sequence[str] = (),
     *,
-    colours: Mapping[str, str] | None = None,
+    colors: Mapping[str, str] | None = None,
     title: str = "Episodes",
 ) -> Figure:
-    """Draw each episode on a map of its own, the line coloured by the battery's charge.
+    """Draw each episode on a map of its own, the line colored by the battery's charge.
 
-    Where a violating step ends stands a cross in the constraint's colour.
+    Where a violating step ends stands a cross in the constraint's color.
 
     Args:
         layout: the map.
         episodes: one for each panel.
         constraint_names: of the columns of the episodes' costs.
-        colours: of the constraints; None chooses them by name.
+        colors: of the constraints; None chooses them by name.
         title: above the panels.
     """
-    colours = dict(colours or constraint_colours(constraint_names))
+    colors = dict(colors or constraint_colors(constraint_names))
     columns = min(len(episodes), _COLUMNS)
     rows = -(-len(episodes) // columns)
     with house_style():
@@ -128,7 +128,7 @@ def trajectories(
             if i + columns >= len(episodes):
                 axes.set_xlabel("x (arena units)")
             line = _draw_episode(axes, episode)
-            broken = _draw_violations(axes, episode, constraint_names, colours)
+            broken = _draw_violations(axes, episode, constraint_names, colors)
             total, reached = float(episode.rewards.sum()), len(episode.goals_reached)
             counted = "1 goal" if reached == 1 else f"{reached} goals"
             # A true minus sign, as on the axes.
@@ -138,7 +138,7 @@ def trajectories(
         bar.outline.set_visible(False)
         bar.ax.axhline(layout.battery_threshold, color=INK, linewidth=1.2)
         crosses = [
-            Line2D([], [], marker=mark, linestyle="none", color=colours[n], label=f"breaks {n}")
+            Line2D([], [], marker=mark, linestyle="none", color=colors[n], label=f"breaks {n}")
             for i, (n, mark) in enumerate(zip(constraint_names, cycle(_MARKS), strict=False))
             if any(episode.costs[:, i].any() for episode in episodes)
         ]
@@ -156,7 +156,7 @@ def _draw_episode(axes: Axes, episode: Episode) -> LineCollection:
     segments = np.stack([episode.positions[:-1], episode.positions[1:]], axis=1)
     line = LineCollection(
         list(segments),
-        cmap=BATTERY_COLOURS,
+        cmap=BATTERY_COLORS,
         norm=Normalize(0, BATTERY_FULL),
         linewidths=1.6,
         capstyle="round",
@@ -168,11 +168,11 @@ def _draw_episode(axes: Axes, episode: Episode) -> LineCollection:
 
 
 def _draw_violations(
-    axes: Axes, episode: Episode, names: Sequence[str], colours: Mapping[str, str]
+    axes: Axes, episode: Episode, names: Sequence[str], colors: Mapping[str, str]
 ) -> str:
     """Mark the steps that broke a constraint; return what the title says of them."""
     for i, (name, mark) in enumerate(zip(names, cycle(_MARKS), strict=False)):
         at = episode.positions[1:][episode.costs[:, i] > 0]
-        axes.plot(*at.T, mark, color=colours[name], markersize=6, markeredgewidth=1.3, zorder=6)
+        axes.plot(*at.T, mark, color=colors[name], markersize=6, markeredgewidth=1.3, zorder=6)
     count = int(episode.costs.sum())
     return f" · {count} violations" if count else ""

@@ -53,7 +53,7 @@ class Explanation:
         share_allowed: of the action bounds, how much all of them allow; None in many dimensions.
         samples: how many samples the shares are of.
         situation: the environment's state in a sentence, or None.
-        is_exact: whether the flow keeps every constraint that it does not drop.
+        is_safe: whether the flow keeps every constraint that it does not drop.
     """
 
     action: Vector
@@ -63,7 +63,7 @@ class Explanation:
     share_allowed: float | None
     samples: int
     situation: str | None
-    is_exact: bool
+    is_safe: bool
 
     def markdown(self) -> str:
         """Return it as Markdown with a table, for a viewer's panel."""
@@ -97,7 +97,7 @@ class Explanation:
             for each in self.constraints
             if each.effect in ("dropped", "broken")
         ]
-        if not said and self.is_exact:
+        if not said and self.is_safe:
             said = ["no constraint changed the executed action"]
         elif not said:
             said = ["the executed action keeps every constraint"]

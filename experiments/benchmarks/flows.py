@@ -1,7 +1,7 @@
 """Time sampling and scoring against TorchRL's TanhNormal and the usual ways to constrain actions.
 
 `python experiments/benchmarks/flows.py [--quick] [--output FOLDER]` measures, on one thread, the
-time of drawing reparametrised actions with their log-densities, and of that plus the backward pass,
+time of drawing reparametrized actions with their log-densities, and of that plus the backward pass,
 for every batch size, dimension and number of constraints, and writes ratios to TanhNormal measured
 in the same run. Distributions are constructed once, outside of the measured time, and in further
 columns anew within it, as an actor does at each call. Compared are the exact flow, eager and
@@ -31,7 +31,7 @@ from torch.func import jacrev, vmap
 from torch.utils.benchmark import Timer
 from torchrl.modules import TanhNormal
 
-from cnfp_torchrl.bijectors import AlignedSquash, RadialSquash
+from cnfp_torchrl.bijectors import ExactSquash, RadialSquash
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
@@ -48,21 +48,21 @@ class Problem:
     scale: Tensor
     low: Tensor
     high: Tensor
-    centre: Tensor
+    anchor: Tensor
     balls: tuple[tuple[Tensor, Tensor], ...]
     boxes: tuple[tuple[Tensor, Tensor], ...]
     active: Tensor
 
     @classmethod
     def random(cls, batch: int, dim: int, constraints: int) -> Problem:
-        """Return a problem with a known centre."""
-        centre = (0.1 * torch.randn(batch, dim)).clamp(-0.3, 0.3)
+        """Return a problem with a known anchor."""
+        anchor = (0.1 * torch.randn(batch, dim)).clamp(-0.3, 0.3)
         balls = tuple(
-            (centre + 0.1 / dim**0.5, 0.3 * dim**0.5 + torch.rand(batch))
+            (anchor + 0.1 / dim**0.5, 0.3 * dim**0.5 + torch.rand(batch))
             for _ in range(0, constraints, 2)
         )
         boxes = tuple(
-            (centre - 0.1 - torch.rand(batch, dim), centre + 0.1 + torch.rand(batch, dim))
+            (anchor - 0.1 - torch.rand(batch, dim), anchor + 0.1 + torch.rand(batch, dim))
             for _ in range(1, constraints, 2)
         )
         return cls(
@@ -70,7 +70,7 @@ class Problem:
             (0.1 + torch.rand(batch, dim)).requires_grad_(),
             -torch.ones(dim),
             torch.ones(dim),
-            centre,
+            anchor,
             balls,
             boxes,
             torch.ones(batch, constraints + 1, dtype=torch.bool),
@@ -86,7 +86,7 @@ class Problem:
         sets: list[ConstraintSet] = [Ball(*ball, validate_args=False) for ball in self.balls]
         sets += [Box(*box, validate_args=False) for box in self.boxes]
         bounds = Box(self.low, self.high, validate_args=False)
-        return Region((bounds, *sets), self.centre, self.active, validate_args=False)
+        return Region((bounds, *sets), self.anchor, self.active, validate_args=False)
 
 
 def tanh_normal(p: Problem) -> TanhNormal:
@@ -96,7 +96,7 @@ def tanh_normal(p: Problem) -> TanhNormal:
 
 def exact_flow(p: Problem) -> ConstrainedFlow:
     """Return the exact flow."""
-    return ConstrainedFlow(p.base(), AlignedSquash(p.region(), validate_args=False))
+    return ConstrainedFlow(p.base(), ExactSquash(p.region(), validate_args=False))
 
 
 def radial_full_jacobian(p: Problem) -> Sample:
@@ -105,14 +105,14 @@ def radial_full_jacobian(p: Problem) -> Sample:
 
     count = len(p.balls)
 
-    def one(latent: Tensor, centre: Tensor, *fields: tuple[Tensor, Tensor]) -> Tensor:
+    def one(latent: Tensor, anchor: Tensor, *fields: tuple[Tensor, Tensor]) -> Tensor:
         balls = [Ball(*each, validate_args=False) for each in fields[:count]]
         boxes = [Box(*each, validate_args=False) for each in fields[count:]]
         sets = (region.bounds, *balls, *boxes)
-        return RadialSquash(Region(sets, centre, validate_args=False))(latent)
+        return RadialSquash(Region(sets, anchor, validate_args=False))(latent)
 
     latent = base.rsample()
-    jacobian = vmap(jacrev(one))(latent, p.centre, *p.balls, *p.boxes)
+    jacobian = vmap(jacrev(one))(latent, p.anchor, *p.balls, *p.boxes)
     log_det = torch.linalg.slogdet(jacobian)[1]
     return RadialSquash(region)(latent), base.log_prob(latent) - log_det
 

@@ -31,8 +31,9 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.stream import FlowStream, StreamHook, flow_blueprint
 
@@ -62,7 +63,7 @@ def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
         PointNavEnv([AGENTS], seed=0),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=["battery", "obstacle"],
-        with_centre=True,
+        with_anchor=True,
     )
     actor = make_constrained_actor(
         StandardNormal(), env.action_spec_unbatched, constraint_bijectors(env)

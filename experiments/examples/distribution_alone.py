@@ -25,7 +25,7 @@ def main() -> None:
     bounds = Box(-torch.ones(2), torch.ones(2))
     ball = Ball(torch.tensor([0.8, 0.0]), torch.tensor(0.7))
     below = HalfSpaces(torch.tensor([[-1.0, 2.0]]), torch.tensor([0.2]))  # 2 y - x <= 0.2
-    region = Region.build([bounds, ball, below])  # finds a centre; the last set has priority
+    region = Region.build([bounds, ball, below])  # finds an anchor; the last set has priority
     base = Independent(Normal(torch.tensor([0.5, -1.0]), torch.tensor([1.5, 1.0])), 1)
     flow = ConstrainedFlow(base, GaugeSquash(region))
 

@@ -112,7 +112,7 @@ def run(control: Control, *, steps: int, agents: int, unsafe: bool = False) -> T
         ConstrainedFlowModule(
             env.action_spec_unbatched,
             constraint_bijectors(env),
-            flow="none" if unsafe else "exact",
+            flow="unconstrained" if unsafe else "exact",
         ),
     )
     return env.rollout(steps, actor)

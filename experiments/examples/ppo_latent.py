@@ -11,14 +11,9 @@ from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    ObstacleGeometry,
-    PointNavEnv,
-    constrain_env,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constrain_env, constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor, split_at_latent
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
 def main() -> None:

@@ -23,14 +23,9 @@ from torchrl.modules import (
 )
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    ObstacleGeometry,
-    PointNavEnv,
-    constrain_env,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constrain_env, constraint_bijectors
 from cnfp_torchrl.modules import constrain
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
 def main() -> None:

@@ -16,14 +16,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3Loss
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    ObstacleGeometry,
-    PointNavEnv,
-    constrain_env,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constrain_env, constraint_bijectors
 from cnfp_torchrl.modules import ConstrainedFlowModule, FlowMap
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
 def main() -> None:

@@ -6,14 +6,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    Layout,
-    ObstacleGeometry,
-    PointNavEnv,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import take_snapshot
 from cnfp_torchrl.visual.banner import flow_banner
@@ -47,7 +42,7 @@ def main(path: Path) -> None:
             "obstacle": ObstacleGeometry(LAYOUT, "obstacle"),
         },
         order=ORDER,
-        with_centre=True,
+        with_anchor=True,
     )
     actor = make_constrained_actor(
         StandardNormal(), env.action_spec_unbatched, constraint_bijectors(env), order=ORDER

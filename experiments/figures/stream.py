@@ -83,7 +83,7 @@ def main() -> None:
 
     folder = RunFolder.open(arguments.run)
     config = folder.load_config()
-    env = build_environment(config, batch_size=[EPISODES], with_centre=True)
+    env = build_environment(config, batch_size=[EPISODES], with_anchor=True)
     actor = load_actor(folder, config, env)
     env.set_seed(0)
     torch.manual_seed(0)

@@ -14,8 +14,8 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from cnfp_torchrl.envs import Layout
 from cnfp_torchrl.modules import guarded
+from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.evaluation import evaluate_seeded
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -63,7 +63,7 @@ def changed(config: DictConfig, change: Callable[[Layout], Layout]) -> DictConfi
     nodes = list(_layouts(content))
     if not nodes:
         raise ValueError(
-            "config: expected an environment with a cnfp_torchrl.envs.Layout, given one without; "
+            "config: expected an environment with a cnfp_torchrl.tasks.point_nav.Layout, given one without; "
             "only point navigation can be changed afterwards"
         )
     for node in nodes:
@@ -98,7 +98,7 @@ def evaluation(folder: RunFolder, config: DictConfig) -> Evaluation:
 
 def _layouts(content: Any) -> Iterator[dict[str, Any]]:
     if isinstance(content, dict):
-        if content.get("_target_") == "cnfp_torchrl.envs.Layout":
+        if content.get("_target_") == "cnfp_torchrl.tasks.point_nav.Layout":
             yield content
         for each in content.values():
             yield from _layouts(each)

@@ -17,14 +17,9 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    Layout,
-    ObstacleGeometry,
-    PointNavEnv,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
@@ -180,7 +175,7 @@ def snapshot(policy: KeptPolicy, name: str) -> FlowSnapshot:
         PointNavEnv(seed=0),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=ORDER,
-        with_centre=True,
+        with_anchor=True,
     )
     kept = policy.gaussians[name]
     actor: SafeProbabilisticTensorDictSequential = make_constrained_actor(

@@ -20,12 +20,12 @@ from torch.linalg import vector_norm
 from cnfp_torchrl.bijectors import (
     BallSquash,
     Bijector,
-    BijectorChain,
     BoxSquash,
     EllipsoidSquash,
     GaugeSquash,
     Retraction,
     ShellSquash,
+    SquashChain,
 )
 from cnfp_torchrl.geometry import (
     Ball,
@@ -39,7 +39,7 @@ from cnfp_torchrl.geometry import (
     WeightedL1Ball,
 )
 from cnfp_torchrl.visual.canvas import house_style, new_figure
-from cnfp_torchrl.visual.colours import FAINT, INK, MUTED
+from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
 from cnfp_torchrl.visual.outlines import Line, View, region_outline, set_outline
 
 COLOR = "#E69F00"
@@ -164,7 +164,7 @@ def _onto(title: str, bijector: Bijector, image: ConstraintSet) -> MappingExampl
 
 def _retraction(ball: Ball) -> MappingExample:
     squash = BoxSquash(BOUNDS.low, BOUNDS.high)
-    chain = BijectorChain([squash, Retraction(BOUNDS, ball, ball.center)])
+    chain = SquashChain([squash, Retraction(BOUNDS, ball, ball.center)])
     return MappingExample(
         "retraction of the bounds", chain, set_outline(ball, _VIEW), _bounds(), first=squash
     )

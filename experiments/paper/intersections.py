@@ -12,7 +12,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.bijectors import AlignedSquash, Bijector, BijectorChain, paper_squash
+from cnfp_torchrl.bijectors import Bijector, ExactSquash, SquashChain, paper_squash
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
 CASES, SAMPLES = 400, 2000
@@ -72,8 +72,8 @@ def _random_region(families: Sequence[type[Ball] | type[Box]]) -> Region:
 
 def _try(region: Region, chosen: Tensor, judged: Sequence[int]) -> Tried:
     bijectors: dict[str, Bijector] = {
-        "squash": BijectorChain([paper_squash(each) for each in region.sets[1:]]),
-        "exact": AlignedSquash(region),
+        "squash": SquashChain([paper_squash(each) for each in region.sets[1:]]),
+        "exact": ExactSquash(region),
     }
     outside, broken = {}, {}
     for flow, bijector in bijectors.items():

@@ -23,7 +23,7 @@ class Label:
     baseline: bool = False
 
 
-# Colors of Okabe and Ito and greys of purple for the exact flow's two entropies; markers differ
+# Colors of Okabe and Ito and grays of purple for the exact flow's two entropies; markers differ
 # too, so that no method is told by its color alone.
 LABELS = {
     "exact": Label("exact flow (ours)", "#4B2E83", "D"),
@@ -36,7 +36,7 @@ LABELS = {
     "lagrangian_threshold": Label("SAC-Lagrangian, small threshold", "#B2182B", "<", baseline=True),
     "penalty": Label("reward penalty", "#8C510A", "v", baseline=True),
     "unconstrained": Label("unconstrained SAC", "#6E6E6E", "X"),
-    "none": Label("action bounds alone", "#3A3A3A", "x"),
+    "unconstrained": Label("action bounds alone", "#3A3A3A", "x"),
 }
 """In the order in which they are shown."""
 

@@ -12,13 +12,13 @@ from mpmath import mpf
 from torch import Tensor
 
 from cnfp_torchrl.bijectors import (
-    AlignedSquash,
     Bijector,
-    BijectorChain,
     BoxSquash,
+    ExactSquash,
     GaugeSquash,
     RadialSquash,
     Retraction,
+    SquashChain,
     paper_squash,
 )
 from cnfp_torchrl.geometry import (
@@ -52,7 +52,7 @@ class Case:
         name: for the test's id.
         kind: squash, chain (the paper's), aligned, gauge, radial or retraction.
         sets: in order of application, float64 of values that float32 holds too.
-        centre: of the kinds that have one, ``(*batch, d)``.
+        anchor: of the kinds that have one, ``(*batch, d)``.
         active: which sets hold, ``(*batch, len(sets))``; None means all.
         smooth: whether the log-density has bounded gradients everywhere.
     """
@@ -60,7 +60,7 @@ class Case:
     name: str
     kind: str
     sets: tuple[ConstraintSet, ...]
-    centre: Tensor | None = None
+    anchor: Tensor | None = None
     active: Tensor | None = None
     smooth: bool = field(default=False, kw_only=True)
 
@@ -71,8 +71,8 @@ class Case:
     @property
     def batch_shape(self) -> torch.Size:
         shapes = [each.batch_shape for each in self.sets]
-        if self.centre is not None:
-            shapes.append(self.centre.shape[:-1])
+        if self.anchor is not None:
+            shapes.append(self.anchor.shape[:-1])
         if self.active is not None:
             shapes.append(self.active.shape[:-1])
         return torch.broadcast_shapes(*shapes)
@@ -85,30 +85,30 @@ class Case:
 
     @property
     def tightness(self) -> float:
-        """How many times the centre's slack fits into the sets' size: an error's amplification."""
-        if self.centre is None:
+        """How many times the anchor's slack fits into the sets' size: an error's amplification."""
+        if self.anchor is None:
             return 1.0
         sizes = [
             float(each.fields()["radius"].max()) for each in self.sets if isinstance(each, Ball)
         ]
-        slack = self.region(torch.float64).slack(self.centre).min()
+        slack = self.region(torch.float64).slack(self.anchor).min()
         return max([self.size, *sizes]) / float(slack)
 
     def cast(self, dtype: torch.dtype) -> tuple[ConstraintSet, ...]:
         return tuple(cast(each, dtype) for each in self.sets)
 
     def region(self, dtype: torch.dtype) -> Region:
-        assert self.centre is not None
-        return Region(self.cast(dtype), self.centre.to(dtype), self.active)
+        assert self.anchor is not None
+        return Region(self.cast(dtype), self.anchor.to(dtype), self.active)
 
     def build(self, dtype: torch.dtype) -> Bijector:
         match self.kind:
             case "squash":
                 return paper_squash(self.cast(dtype)[0])
             case "chain":
-                return BijectorChain([paper_squash(each) for each in self.cast(dtype)])
+                return SquashChain([paper_squash(each) for each in self.cast(dtype)])
             case "aligned":
-                return AlignedSquash(self.region(dtype))
+                return ExactSquash(self.region(dtype))
             case "gauge":
                 return GaugeSquash(self.region(dtype))
             case "radial":
@@ -116,9 +116,9 @@ class Case:
             case "retraction":
                 outer, inner = self.cast(dtype)
                 assert isinstance(outer, Box)
-                assert self.centre is not None
-                retraction = Retraction(outer, inner, self.centre.to(dtype))
-                return BijectorChain([BoxSquash(outer.low, outer.high), retraction])
+                assert self.anchor is not None
+                retraction = Retraction(outer, inner, self.anchor.to(dtype))
+                return SquashChain([BoxSquash(outer.low, outer.high), retraction])
         raise ValueError(self.kind)
 
     def allows(self, action: Tensor, number: type = float) -> Tensor:
@@ -142,10 +142,10 @@ class Case:
             sets = [each for each, holds in zip(sets, active, strict=True) if holds]
         if self.kind in ("squash", "chain"):
             return reference_chain(sets)
-        assert self.centre is not None
-        centre = self.centre.expand((*self.batch_shape, self.dim))[index]
+        assert self.anchor is not None
+        anchor = self.anchor.expand((*self.batch_shape, self.dim))[index]
         flow = FLOWS[self.kind]
-        return lambda latent: flow(sets, centre, latent)
+        return lambda latent: flow(sets, anchor, latent)
 
 
 def reference_chain(
@@ -182,18 +182,18 @@ def element(each: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]
     return type(each)(**values)
 
 
-# Random sets around a centre. All numbers are rounded to float32, so that both dtypes mean the same
-# sets; the slack of the centre is what remains after that.
+# Random sets around an anchor. All numbers are rounded to float32, so that both dtypes mean the same
+# sets; the slack of the anchor is what remains after that.
 
 
 class Maker:
-    """Make random sets that hold a common centre with a given slack.
+    """Make random sets that hold a common anchor with a given slack.
 
     Args:
         dim: d.
         batch_shape: of everything that is made.
         size: the half-width of the action bounds.
-        slack: the centre's least distance to each boundary, in units of `size`.
+        slack: the anchor's least distance to each boundary, in units of `size`.
         offset: how far from 0 the bounds lie, in units of `size`.
     """
 
@@ -212,12 +212,12 @@ class Maker:
         middle = offset * size * self.normal(dim)
         half = size * (0.5 + self.uniform(dim))
         self.low, self.high = rounded(middle - half), rounded(middle + half)
-        # Rounding errors of float32 in all that follows, twice, as the package's own centres have.
+        # Rounding errors of float32 in all that follows, twice, as the package's own anchors have.
         magnitude = float(torch.maximum(self.low.abs(), self.high.abs()).max())
         self.rounding = 64 * 2.0**-23 * magnitude * math.sqrt(dim)
         self.slack = slack * size + self.rounding
         margin = self.slack + (2 * half - 2 * self.slack) * self.uniform(dim) ** 3
-        self.centre = rounded(
+        self.anchor = rounded(
             torch.where(self.uniform(dim) < 0.5, middle - half + margin, middle + half - margin)
         )
 
@@ -232,7 +232,7 @@ class Maker:
         return vector / vector.norm(dim=-1, keepdim=True)
 
     def gap(self) -> Tensor:
-        """Return distances from the centre to a boundary: the slack to 30 times as much."""
+        """Return distances from the anchor to a boundary: the slack to 30 times as much."""
         return self.slack * 30 ** self.uniform(1)
 
     def bounds(self) -> Box:
@@ -240,7 +240,7 @@ class Maker:
 
     def box(self) -> Box:
         below, above = (self.slack * 30 ** self.uniform(self.dim) for _ in range(2))
-        return Box(rounded(self.centre - below), rounded(self.centre + above))
+        return Box(rounded(self.anchor - below), rounded(self.anchor + above))
 
     def open_box(self) -> Box:
         box = self.box()
@@ -249,7 +249,7 @@ class Maker:
     def ball(self, radius: float = 0.8) -> Ball:
         r = radius * self.size * (0.5 + self.uniform(1))
         gap = torch.minimum(self.gap() + 2 * self.rounding * radius, r)
-        center = self.centre - (r - gap) * self.direction()
+        center = self.anchor - (r - gap) * self.direction()
         return Ball(rounded(center), rounded(r.squeeze(-1)))
 
     def large_ball(self) -> Ball:
@@ -263,21 +263,21 @@ class Maker:
         inverse = torch.linalg.inv(tril).norm(dim=(-2, -1)).unsqueeze(-1)
         depth = 1 - torch.clamp((self.gap() + 8 * self.rounding) * inverse, max=1.0)
         white = self.direction() * depth
-        return Ellipsoid(rounded(self.centre - (tril @ white.unsqueeze(-1)).squeeze(-1)), tril)
+        return Ellipsoid(rounded(self.anchor - (tril @ white.unsqueeze(-1)).squeeze(-1)), tril)
 
     def half_spaces(self, rows: int = 3) -> HalfSpaces:
         normals = rounded(self.normal(rows, self.dim))
         gap = (self.slack * 30 ** self.uniform(rows)) * normals.norm(dim=-1)
-        return HalfSpaces(normals, rounded((normals * self.centre.unsqueeze(-2)).sum(-1) + gap))
+        return HalfSpaces(normals, rounded((normals * self.anchor.unsqueeze(-2)).sum(-1) + gap))
 
     def weighted_l1(self) -> WeightedL1Ball:
         weights = rounded(self.normal(self.dim))
-        used = (weights * self.centre).abs().sum(-1)
+        used = (weights * self.anchor).abs().sum(-1)
         return WeightedL1Ball(weights, rounded(used + self._room(weights)))
 
     def positive_part(self) -> PositivePart:
         weights = rounded(self.normal(self.dim))
-        used = (weights * self.centre).clamp(min=0).sum(-1)
+        used = (weights * self.anchor).clamp(min=0).sum(-1)
         return PositivePart(weights, rounded(used + self._room(weights)))
 
     def task_space_ball(self) -> TaskSpaceBall:
@@ -288,7 +288,7 @@ class Maker:
         radius = gap + norm * self.size * self.uniform(1).squeeze(-1)
         towards = self.normal(jacobian.shape[-2])
         towards = towards / towards.norm(dim=-1, keepdim=True) * (radius - gap).unsqueeze(-1)
-        image = (jacobian * self.centre.unsqueeze(-2)).sum(-1)
+        image = (jacobian * self.anchor.unsqueeze(-2)).sum(-1)
         return TaskSpaceBall(jacobian, rounded(towards - image), rounded(radius))
 
     def _room(self, weights: Tensor) -> Tensor:
@@ -354,12 +354,12 @@ Regions = dict[str, tuple[tuple[ConstraintSet, ...], Tensor, Tensor | None]]
 
 @cache
 def regions() -> Regions:
-    """Regions: sets, centre and active flags by name."""
+    """Regions: sets, anchor and active flags by name."""
     found: Regions = {}
 
     def add(name: str, make: Maker, *families: Callable[[Maker], ConstraintSet]) -> None:
         sets = (make.bounds(), *(family(make) for family in families))
-        found[name] = (sets, make.centre, None)
+        found[name] = (sets, make.anchor, None)
 
     add("bounds-d1", Maker(1, seed=20))
     add("ball-d1", Maker(1, seed=21), Maker.ball)
@@ -404,8 +404,8 @@ def regions() -> Regions:
     )
     # A set a thousand times smaller than the bounds around it.
     tiny = Maker(3, size=1e-3, seed=35)
-    bounds = Box(rounded(tiny.centre - 1), rounded(tiny.centre + 1))
-    found["tiny-in-large-d3"] = ((bounds, tiny.bounds(), tiny.ball()), tiny.centre, None)
+    bounds = Box(rounded(tiny.anchor - 1), rounded(tiny.anchor + 1))
+    found["tiny-in-large-d3"] = ((bounds, tiny.bounds(), tiny.ball()), tiny.anchor, None)
     found["huge-ball-d2"] = _huge_ball()
     found["visible-d2-batch"] = _visible()
     found["dropped-d3-batch"] = _dropped()
@@ -414,24 +414,24 @@ def regions() -> Regions:
 
 
 def _huge_ball() -> tuple[tuple[ConstraintSet, ...], Tensor, None]:
-    """A battery far from its station: the ball's centre is 72 away, its boundary in the bounds."""
+    """A battery far from its station: the ball's center is 72 away, its boundary in the bounds."""
     ball = Ball(tensor(-50.9116, -50.9117), tensor(72.5).squeeze())
     return (Box(tensor(-1.0, -1.0), tensor(1.0, 1.0)), ball), tensor(0.25, -0.125), None
 
 
 def _visible() -> tuple[tuple[ConstraintSet, ...], Tensor, None]:
-    """Three places beside a rectangle in an arena, and a ball; the centre is not always 0."""
+    """Three places beside a rectangle in an arena, and a ball; the anchor is not always 0."""
     rectangle = torch.stack([tensor(-0.3, -0.3), tensor(0.3, 0.3)]).unsqueeze(0)
     walls = VisibleRegion.walls(tensor(-1.0, -1.0), tensor(1.0, 1.0))
     position = torch.stack([tensor(-0.35, 0.32), tensor(0.6, -0.31), tensor(0.95, 0.95)])
     seen = VisibleRegion(position, torch.cat([rectangle, walls]), tensor(0.1).squeeze())
-    centre = torch.stack([tensor(-0.25, 0.0), tensor(0.125, -0.25), tensor(-0.125, -0.125)])
+    anchor = torch.stack([tensor(-0.25, 0.0), tensor(0.125, -0.25), tensor(-0.125, -0.125)])
     bounds = Box(tensor(-1.0, -1.0), tensor(1.0, 1.0))
-    return (bounds, seen, Ball(tensor(-0.25, 0.0), tensor(0.8).squeeze())), centre, None
+    return (bounds, seen, Ball(tensor(-0.25, 0.0), tensor(0.8).squeeze())), anchor, None
 
 
 def _dropped() -> tuple[tuple[ConstraintSet, ...], Tensor, Tensor]:
-    """Four states of three constraints; where one is dropped, the centre does not lie in it."""
+    """Four states of three constraints; where one is dropped, the anchor does not lie in it."""
     make = Maker(3, (4,), seed=36)
     active = torch.tensor(
         [
@@ -443,42 +443,42 @@ def _dropped() -> tuple[tuple[ConstraintSet, ...], Tensor, Tensor]:
     )
     ball = make.ball()
     away = Ball(torch.where(active[:, 1:2], ball.center, ball.center + 100.0), ball.radius)
-    return (make.bounds(), away, make.ellipsoid(), make.positive_part()), make.centre, active
+    return (make.bounds(), away, make.ellipsoid(), make.positive_part()), make.anchor, active
 
 
 def _mixed() -> tuple[tuple[ConstraintSet, ...], Tensor, Tensor]:
-    """One centre, and sets and flags whose batch shapes have to be broadcast."""
+    """One anchor, and sets and flags whose batch shapes have to be broadcast."""
     one, rows, columns = Maker(3, seed=37), Maker(3, (4, 1), seed=38), Maker(3, (2,), seed=39)
-    rows.centre = columns.centre = one.centre
+    rows.anchor = columns.anchor = one.anchor
     active = torch.tensor([[True, True, True], [True, False, True]])
-    return (one.bounds(), rows.ball(), columns.half_spaces()), one.centre, active
+    return (one.bounds(), rows.ball(), columns.half_spaces()), one.anchor, active
 
 
 @cache
 def exact_flows() -> tuple[Case, ...]:
     """Gauge and radial squashes over all regions, and retractions."""
     found = []
-    for name, (sets, centre, active) in regions().items():
+    for name, (sets, anchor, active) in regions().items():
         smooth = len(sets) == 1
-        found.append(Case(f"gauge-{name}", "gauge", sets, centre, active, smooth=smooth))
+        found.append(Case(f"gauge-{name}", "gauge", sets, anchor, active, smooth=smooth))
         boxes = all(isinstance(each, Box) for each in sets)
-        found.append(Case(f"aligned-{name}", "aligned", sets, centre, active, smooth=boxes))
-        found.append(Case(f"radial-{name}", "radial", sets, centre, active))
+        found.append(Case(f"aligned-{name}", "aligned", sets, anchor, active, smooth=boxes))
+        found.append(Case(f"radial-{name}", "radial", sets, anchor, active))
     plane, many = Maker(2, seed=40), Maker(6, (3,), slack=0.05, seed=41)
     tight = Maker(3, (5,), slack=1e-4, seed=42)
     found += [
-        Case("retraction-ball-d2", "retraction", (plane.bounds(), plane.ball()), plane.centre),
+        Case("retraction-ball-d2", "retraction", (plane.bounds(), plane.ball()), plane.anchor),
         Case(
             "retraction-ellipsoid-d6-batch",
             "retraction",
             (many.bounds(), many.ellipsoid()),
-            many.centre,
+            many.anchor,
         ),
         Case(
             "retraction-tight-d3-batch",
             "retraction",
             (tight.bounds(), tight.large_ball()),
-            tight.centre,
+            tight.anchor,
         ),
     ]
     return tuple(found)

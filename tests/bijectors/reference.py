@@ -41,7 +41,7 @@ def contains(
         each: the set.
         action: ``(*sample, *batch, d)``.
         number: the type to compute in, longer than the tensors' own: its rounding errors must be
-            far below the distance of two neighbouring actions.
+            far below the distance of two neighboring actions.
     """
     a = action.detach().numpy().astype(number)
     fields = {name: value.numpy().astype(number) for name, value in each.fields().items()}
@@ -163,9 +163,9 @@ def ellipsoid_squash(ellipsoid: Ellipsoid, latent: Vector) -> tuple[Vector, mpf]
 
 
 def gauge_squash(
-    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+    sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:
-    box, c = sets[0], to_mp(centre)
+    box, c = sets[0], to_mp(anchor)
     assert isinstance(box, Box)
     bounded, log_det = box_squash(box, latent)
     offset = [x - y for x, y in zip(bounded, c, strict=True)]
@@ -175,14 +175,14 @@ def gauge_squash(
 
 
 def aligned_squash(
-    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+    sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:
     """Scale each component to the intersection of the boxes, then retract from there."""
     boxes, others = ([s for s in sets if isinstance(s, Box) == is_box] for is_box in (True, False))
     low, high = boxes[0].low, boxes[0].high
     for box in boxes[1:]:
         low, high = low.maximum(box.low), high.minimum(box.high)
-    c = to_mp(centre)
+    c = to_mp(anchor)
     bounded, log_det = box_squash(boxes[0], latent)
     offset = []
     for i, x in enumerate(bounded):
@@ -196,27 +196,27 @@ def aligned_squash(
 
 
 def radial_squash(
-    sets: Sequence[ConstraintSet], centre: Tensor, latent: Vector
+    sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:
-    c, rho = to_mp(centre), mp.sqrt(sum(z**2 for z in latent))
+    c, rho = to_mp(anchor), mp.sqrt(sum(z**2 for z in latent))
     point, log_det = unit_ball_squash(latent)
     width = exit_along(c, [z / rho for z in latent], sets)
     return along(c, point, width), log_det + len(latent) * mp.log(width)
 
 
-def exit_along(centre: Vector, offset: Vector, sets: Sequence[ConstraintSet]) -> mpf:
-    """Return the largest t with ``centre + t offset`` in all sets, the first of them a box."""
+def exit_along(anchor: Vector, offset: Vector, sets: Sequence[ConstraintSet]) -> mpf:
+    """Return the largest t with ``anchor + t offset`` in all sets, the first of them a box."""
     box = sets[0]
     assert isinstance(box, Box)
-    faces = zip(to_mp(box.low), to_mp(box.high), centre, offset, strict=True)
+    faces = zip(to_mp(box.low), to_mp(box.high), anchor, offset, strict=True)
     outside = min(((high if v > 0 else low) - c) / v for low, high, c, v in faces if v != 0)
     for each in sets[1:]:
         inside, beyond = mpf(0), outside
-        if level(each, along(centre, offset, beyond)) <= 1:
+        if level(each, along(anchor, offset, beyond)) <= 1:
             continue
         while beyond - inside > beyond * mpf(10) ** -20:
             middle = (inside + beyond) / 2
-            if level(each, along(centre, offset, middle)) <= 1:
+            if level(each, along(anchor, offset, middle)) <= 1:
                 inside = middle
             else:
                 beyond = middle
@@ -240,8 +240,8 @@ def to_mp(value: Tensor) -> mpf | Vector | list[Vector]:
     return convert(value.double().tolist())
 
 
-def along(centre: Vector, offset: Vector, share: mpf) -> Vector:
-    return [c + share * v for c, v in zip(centre, offset, strict=True)]
+def along(anchor: Vector, offset: Vector, share: mpf) -> Vector:
+    return [c + share * v for c, v in zip(anchor, offset, strict=True)]
 
 
 def dot(left: Vector, right: Vector) -> mpf:

@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.bijectors import (
-    AlignedSquash,
     Bijector,
-    BijectorChain,
     BoxSquash,
+    ExactSquash,
     GaugeSquash,
     RadialSquash,
     Retraction,
+    SquashChain,
     paper_squash,
 )
 from cnfp_torchrl.distributions import ConstrainedFlow
@@ -52,21 +52,21 @@ def unchecked(case: Case, fields: list[dict[str, Tensor]]) -> tuple[ConstraintSe
     )
 
 
-def build(case: Case, fields: list[dict[str, Tensor]], centre: Tensor) -> Bijector:
+def build(case: Case, fields: list[dict[str, Tensor]], anchor: Tensor) -> Bijector:
     """Build a case's bijector from bare tensors, without reading any of them on the host."""
     sets = unchecked(case, fields)
     if case.kind == "squash":
         return paper_squash(sets[0])
     if case.kind == "chain":
-        return BijectorChain([paper_squash(each) for each in sets])
+        return SquashChain([paper_squash(each) for each in sets])
     if case.kind == "retraction":
         outer = sets[0]
         assert isinstance(outer, Box)
         squash = BoxSquash(outer.low, outer.high, validate_args=False)
-        return BijectorChain([squash, Retraction(outer, sets[1], centre)])
-    region = Region(sets, centre, case.active)
+        return SquashChain([squash, Retraction(outer, sets[1], anchor)])
+    region = Region(sets, anchor, case.active)
     if case.kind == "aligned":
-        return AlignedSquash(region, validate_args=False)
+        return ExactSquash(region, validate_args=False)
     if case.kind == "gauge":
         return GaugeSquash(region, validate_args=False)
     return RadialSquash(region)
@@ -74,16 +74,16 @@ def build(case: Case, fields: list[dict[str, Tensor]], centre: Tensor) -> Biject
 
 def function(case: Case) -> Function:
     def forward(
-        latent: Tensor, fields: list[dict[str, Tensor]], centre: Tensor
+        latent: Tensor, fields: list[dict[str, Tensor]], anchor: Tensor
     ) -> tuple[Tensor, Tensor]:
-        return build(case, fields, centre).forward_and_log_det(latent)
+        return build(case, fields, anchor).forward_and_log_det(latent)
 
     return forward
 
 
 def arguments(case: Case) -> tuple[list[dict[str, Tensor]], Tensor]:
     fields = [cast(each, torch.float32).fields() for each in case.sets]
-    return fields, torch.zeros(case.dim) if case.centre is None else case.centre.float()
+    return fields, torch.zeros(case.dim) if case.anchor is None else case.anchor.float()
 
 
 def evaluate(forward: Function, case: Case, latent: Tensor) -> tuple[Tensor, ...]:
@@ -112,10 +112,10 @@ def test_compiled_bijectors_agree(name: str) -> None:
 
 def actor(case: Case) -> Callable[..., tuple[Tensor, Tensor]]:
     def sample(
-        loc: Tensor, scale: Tensor, fields: list[dict[str, Tensor]], centre: Tensor
+        loc: Tensor, scale: Tensor, fields: list[dict[str, Tensor]], anchor: Tensor
     ) -> tuple[Tensor, Tensor]:
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-        return ConstrainedFlow(base, build(case, fields, centre)).rsample_and_log_prob()
+        return ConstrainedFlow(base, build(case, fields, anchor)).rsample_and_log_prob()
 
     return sample
 

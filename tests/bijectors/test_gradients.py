@@ -70,14 +70,14 @@ def test_log_det_gradients_are_bounded(case: Case, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_gradients_near_the_centre_are_bounded_where_nothing_binds(dtype: torch.dtype) -> None:
+def test_gradients_near_the_anchor_are_bounded_where_nothing_binds(dtype: torch.dtype) -> None:
     bounds = Box(tensor(-1.0, -0.5, -3.0), tensor(1.0, 2.0, 1.5))
     loose = Ball(tensor(0.3, -0.2, 0.0), tensor(10.0).squeeze())
     sets = cast(bounds, dtype), cast(loose, dtype)
     bijector = GaugeSquash(Region(sets, tensor(0.1, 0.3, -0.4).to(dtype)))
-    centre = bijector.inverse_and_log_det(bijector.region.centre)[0]
+    anchor = bijector.inverse_and_log_det(bijector.region.anchor)[0]
     for length in (0.0, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2):
-        z = centre + length * torch.randn(200, 3, dtype=dtype)
+        z = anchor + length * torch.randn(200, 3, dtype=dtype)
         of_action, of_log_det = gradients(bijector, z)
         assert of_log_det.abs().max() <= 2.0
         assert of_action.abs().max() <= 2.25 * 1.001
@@ -95,7 +95,7 @@ def test_gradients_in_one_dimension_are_bounded(dtype: torch.dtype) -> None:
         assert of_log_det.abs().max() <= 2.0
 
 
-def test_log_det_gradient_grows_like_one_over_the_distance_to_the_centre() -> None:
+def test_log_det_gradient_grows_like_one_over_the_distance_to_the_anchor() -> None:
     """As documented: the direction's share of the log-density, seen from ever nearer."""
     sets = Box(tensor(-1.0, -1.0), tensor(1.0, 1.0)), Ball(tensor(0.2, 0.0), tensor(0.5).squeeze())
     bijector = GaugeSquash(Region(sets, tensor(0.0, 0.0)))

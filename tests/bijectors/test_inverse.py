@@ -35,7 +35,7 @@ def test_inverse_undoes_forward(case: Case, dtype: torch.dtype) -> None:
     scored = resolved
     if case.kind == "aligned":
         # The density jumps where a component of the offset changes its sign.
-        offset = exact.stages(z.double()).actions[0] - case.centre
+        offset = exact.stages(z.double()).actions[0] - case.anchor
         scored = scored & (offset.abs() > eps * case.size).all(-1)
         assert scored.double().mean() > (0.2 if dtype == torch.float32 else 0.8)
     assert ((inverse_log_det + log_det).abs() <= 6 * case.dim * moved)[scored].all()
@@ -48,23 +48,23 @@ def test_every_allowed_action_has_a_latent(case: Case) -> None:
     if case.kind == "chain":
         pytest.skip("the paper's chain covers a part of its last set only")
     if "visible" in case.name:
-        pytest.skip("about a centre other than 0 the flow covers what the centre sees")
+        pytest.skip("about an anchor other than 0 the flow covers what the anchor sees")
     bijector = case.build(torch.float64)
     box = case.sets[-1 if case.kind == "squash" else 0].bounding_box()
-    if case.centre is not None:
-        # The finest cells lie around the centre, for sets that are small in their bounds.
+    if case.anchor is not None:
+        # The finest cells lie around the anchor, for sets that are small in their bounds.
         shares = torch.linspace(-1, 1, 81, dtype=torch.float64)
         shares = shares.abs() ** 3 * shares.sign()
-        centre = case.centre
+        anchor = case.anchor
     else:
         shares = torch.linspace(-1, 1, 81, dtype=torch.float64)
-        centre = (box.low + box.high) / 2
-    reach = torch.maximum(box.high - centre, centre - box.low) * 1.01
+        anchor = (box.low + box.high) / 2
+    reach = torch.maximum(box.high - anchor, anchor - box.low) * 1.01
     grid = torch.cartesian_prod(shares, shares).reshape(-1, *[1] * len(case.batch_shape), 2)
-    action = centre + grid * reach
+    action = anchor + grid * reach
     action = action.expand(-1, *case.batch_shape, 2)
     inside = case.allows(action)
-    # Erosion leaves a seam at the boundary: cells are judged whose neighbours agree with them.
+    # Erosion leaves a seam at the boundary: cells are judged whose neighbors agree with them.
     seam = 1e-12 * case.size * torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]]).double()
     around = torch.stack([case.allows(action + offset) for offset in seam])
     judged = (around == inside).all(0)
@@ -73,7 +73,7 @@ def test_every_allowed_action_has_a_latent(case: Case) -> None:
 
     contained = bijector.contains(action)
     assert torch.equal(contained[judged], inside[judged])
-    latent = bijector.inverse_and_log_det(torch.where(inside.unsqueeze(-1), action, centre))[0]
+    latent = bijector.inverse_and_log_det(torch.where(inside.unsqueeze(-1), action, anchor))[0]
     reached = inside & judged
     assert latent[reached].isfinite().all()
     error = (bijector(latent) - action).abs().amax(-1)[reached]

@@ -32,7 +32,7 @@ def test_forward_and_log_det_match_mpmath(case: Case, length: float) -> None:
     bijector = case.build(torch.float64)
     z = latents(case, 1, torch.float64, length)
     action, log_det = bijector.forward_and_log_det(z)
-    # The seam left by erosion, 16 eps wide, counts more the nearer the centre lies to a boundary.
+    # The seam left by erosion, 16 eps wide, counts more the nearer the anchor lies to a boundary.
     close = 1e-9 + 1e-13 * case.dim * case.tightness
     for index in some_indices(case.batch_shape):
         expected_action, expected = case.reference(index)(exact(z[0][index]))

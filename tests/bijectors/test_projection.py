@@ -37,7 +37,7 @@ class Kind:
     def case(self) -> Case:
         make = Maker(self.dim, (40,), size=self.size, slack=0.05, seed=self.dim)
         sets = (make.bounds(), *(family(make) for family in self.families))
-        return Case("", "projection", sets, make.centre)
+        return Case("", "projection", sets, make.anchor)
 
 
 KINDS = {
@@ -91,7 +91,7 @@ def test_an_allowed_action_stays_as_it_is(kind: Kind) -> None:
     case, projection = build(kind, torch.float64)
     region = case.region(torch.float64)
     way = torch.nn.functional.normalize(latents(case, 200, torch.float64, 1.0), dim=-1)
-    allowed = region.centre + 0.9 * region.slack(region.centre).unsqueeze(-1) * way
+    allowed = region.anchor + 0.9 * region.slack(region.anchor).unsqueeze(-1) * way
     latent, _ = BoxSquash.onto(region.eroded().bounds).inverse_and_log_det(allowed)
     torch.testing.assert_close(projection(latent), allowed, rtol=0, atol=1e-9 * case.size)
 
@@ -172,6 +172,6 @@ def test_rounds_are_checked(rounds: int) -> None:
 
 def test_other_families_are_refused() -> None:
     make = Maker(2, slack=0.05)
-    region = Region((make.bounds(), make.ellipsoid()), make.centre)
+    region = Region((make.bounds(), make.ellipsoid()), make.anchor)
     with pytest.raises(TypeError, match=r"closed-form projection, one of .* given Ellipsoid"):
         Projection(region, rounds=1)(torch.zeros(2, dtype=torch.float64))

@@ -9,12 +9,12 @@ import torch
 
 from cnfp_torchrl.bijectors import (
     BallSquash,
-    BijectorChain,
     BoxSquash,
     EllipsoidSquash,
     GaugeSquash,
     RadialSquash,
     Retraction,
+    SquashChain,
     paper_squash,
 )
 from cnfp_torchrl.geometry import Ball, Box, GeometryError, HalfSpaces, Region
@@ -50,7 +50,7 @@ REFUSED = {
     ),
     "region of two precisions": (
         lambda: GaugeSquash(Region((BOX, Ball(ZERO.double(), ONE[0].double())), ZERO)),
-        "sets and centre: expected one dtype, given [torch.float32, torch.float64] and torch.float",
+        "sets and anchor: expected one dtype, given [torch.float32, torch.float64] and torch.float",
     ),
     "scalar bounds": (
         lambda: BoxSquash(torch.tensor(-1.0), torch.tensor(1.0)),
@@ -112,7 +112,7 @@ def test_bad_input_is_refused(name: str) -> None:
 
 def test_empty_chain_is_refused() -> None:
     with pytest.raises(ValueError, match="bijectors: expected at least one, given an empty chain"):
-        BijectorChain([])
+        SquashChain([])
 
 
 def test_family_without_a_squash_is_refused() -> None:

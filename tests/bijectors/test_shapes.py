@@ -58,12 +58,12 @@ def test_each_batch_element_is_computed_by_itself(case: Case) -> None:
 def single(case: Case, at: tuple[int, ...]) -> Case:
     """Return the case of one batch element."""
     sets = tuple(element(each, case.batch_shape, at) for each in case.sets)
-    centre, active = case.centre, case.active
-    if centre is not None:
-        centre = centre.expand((*case.batch_shape, case.dim))[at]
+    anchor, active = case.anchor, case.active
+    if anchor is not None:
+        anchor = anchor.expand((*case.batch_shape, case.dim))[at]
     if active is not None:
         active = active.expand((*case.batch_shape, len(sets)))[at]
-    return Case(case.name, case.kind, sets, centre, active)
+    return Case(case.name, case.kind, sets, anchor, active)
 
 
 @pytest.mark.parametrize("case", BATCHED, **ids)

@@ -21,16 +21,14 @@ from torchrl.envs import (
 )
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import (
+from cnfp_torchrl.envs import ActionGuard, constrain_env, constraint_bijectors
+from cnfp_torchrl.modules import ConstraintViolationError, make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import (
     POINT_NAV_ID,
-    ActionGuard,
     BatteryGeometry,
     ObstacleGeometry,
     PointNavEnv,
-    constrain_env,
-    constraint_bijectors,
 )
-from cnfp_torchrl.modules import ConstraintViolationError, make_constrained_actor
 from cnfp_torchrl.training.networks import gaussian_network
 
 AGENTS = 16
@@ -142,7 +140,7 @@ def test_specs() -> None:
 def test_only_what_is_stepped_is_checked(agent: int) -> None:
     env = guarded_env(3)
     state = calm(env)
-    state["action"] = state["constraints", "centre"].clone()
+    state["action"] = state["constraints", "anchor"].clone()
     state["action"][agent] = 5.0
     message = rf"constraint 'bounds'.*given \[5.0, 5.0\].*batch index \[{agent}\]"
     with pytest.raises(ConstraintViolationError, match=message):
@@ -159,9 +157,9 @@ def test_what_it_needs_is_said() -> None:
     no_geometry = TransformedEnv(PointNavEnv([3]), Compose(RewardSum(), ActionGuard()))
     with pytest.raises(ValueError, match="publishes at least one constraint"):
         no_geometry.rollout(1)
-    no_centre = TransformedEnv(PointNavEnv([3]), Compose(BatteryGeometry(), ActionGuard()))
+    no_anchor = TransformedEnv(PointNavEnv([3]), Compose(BatteryGeometry(), ActionGuard()))
     with pytest.raises(ValueError, match=r"publishes \('constraints', 'battery', 'active'\)"):
-        no_centre.rollout(1)
+        no_anchor.rollout(1)
     with pytest.raises(KeyError, match=r"expected action, found keys .*call a policy"):
         env.transform.inv(state)
     with pytest.raises(RuntimeError, match="expected to be part of an environment"):

@@ -6,7 +6,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, GymEnv, TransformedEnv, check_env_specs
 
-from cnfp_torchrl.envs import ConstraintCost, PointNavEnv, constraint_names
+from cnfp_torchrl.envs import ConstraintCost, constraint_names
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 
 
 def fast(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:

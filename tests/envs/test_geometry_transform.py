@@ -11,14 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    GeometryTransform,
-    ObstacleGeometry,
-    PointNavEnv,
-    constrain_env,
-)
+from cnfp_torchrl.envs import GeometryTransform, constrain_env
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, GeometryError
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
 class SpeedLimit(GeometryTransform):
@@ -152,7 +147,7 @@ def test_a_set_must_be_one() -> None:
             Broken(bad)(TensorDict({"observation": torch.zeros(3, 5)}, batch_size=3))
 
 
-@pytest.mark.parametrize("name", ["", "centre", "safe_action", 3])
+@pytest.mark.parametrize("name", ["", "anchor", "safe_action", 3])
 def test_a_constraint_needs_a_name_of_its_own(name: object) -> None:
     with pytest.raises(ValueError, match="name: expected"):
         SpeedLimit(name)  # type: ignore[arg-type]

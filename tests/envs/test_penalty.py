@@ -9,7 +9,8 @@ from omegaconf import DictConfig
 from torchrl.envs import Compose, GymEnv, RewardSum, TransformedEnv, check_env_specs
 
 from cnfp_torchrl.configuration import config_directory
-from cnfp_torchrl.envs import PointNavEnv, RewardPenalty
+from cnfp_torchrl.envs import RewardPenalty
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.agent import build_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train

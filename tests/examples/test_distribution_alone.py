@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 
-def test_contained_and_normalised(run: Callable[..., str]) -> None:
+def test_contained_and_normalized(run: Callable[..., str]) -> None:
     printed = run("distribution_alone", "--samples", 20000, "--grid", 1000)
     assert "0 of 20000 samples outside" in printed
     (total,) = re.findall(r"integrates to (\S+)", printed)

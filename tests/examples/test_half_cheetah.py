@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import ConstraintCentre, constraint_bijectors
+from cnfp_torchrl.envs import ConstraintAnchor, constraint_bijectors
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 pytest.importorskip("mujoco", reason="needs MuJoCo, of the extra 'examples'")
@@ -69,7 +69,7 @@ def test_hostile_actions_meet_the_limit_and_not_more(
         GymEnv("HalfCheetah-v5"), Compose(DoubleToFloat(), load(SCRIPT.stem).PowerLimit("power"))
     )
     bijectors = constraint_bijectors(env)
-    env.append_transform(ConstraintCentre(bijectors))
+    env.append_transform(ConstraintAnchor(bijectors))
     actor = TensorDictSequential(
         TensorDictModule(along, ["observation"], ["loc", "scale"]),
         ConstrainedFlowModule(env.action_spec_unbatched, bijectors),

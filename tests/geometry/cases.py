@@ -200,13 +200,13 @@ class Case:
         picked = torch.stack(kinds)[each % len(kinds), each]
         return picked.to(dtype) * self.size / picked.abs().amax(-1, keepdim=True).to(dtype)
 
-    def centres(self, dtype: torch.dtype) -> list[Tensor]:
-        """Return centres from the middle out to where the minimum slack is left, in a dtype."""
+    def anchors(self, dtype: torch.dtype) -> list[Tensor]:
+        """Return anchors from the middle out to where the minimum slack is left, in a dtype."""
         sets, inside = self.cast(dtype), self.inside.to(dtype)
         bounds = self.bounds.with_fields(lambda field, _: field.to(dtype))
         magnitude = bounds.high.amax()
         twice = [x.eroded(magnitude).eroded(magnitude) for x in (sets, bounds)]
-        centres = [inside]
+        anchors = [inside]
         for direction in self.directions(4, dtype):
             gauge = torch.maximum(*(x.gauge(direction, inside) for x in twice))
             chosen = inside
@@ -214,8 +214,8 @@ class Case:
                 trial = inside + direction * ((1 - depth) / gauge).unsqueeze(-1)
                 slack = torch.minimum(*(x.slack(trial) for x in twice))
                 chosen = torch.where((slack >= MINIMUM_SLACK).unsqueeze(-1), trial, chosen)
-            centres.append(chosen)
-        return centres
+            anchors.append(chosen)
+        return anchors
 
 
 def _scaled(sets: ConstraintSet, size: float) -> ConstraintSet:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, PositivePart, WeightedL1Ball
-from cnfp_torchrl.geometry.barrier import maximise_slack, newton
+from cnfp_torchrl.geometry.barrier import maximize_slack, newton
 from cnfp_torchrl.geometry.slack_program import Point, Program
 from tests.geometry.cases import CASES, Case
 
@@ -57,8 +57,8 @@ def test_inactive_sets_change_nothing() -> None:
     active = torch.tensor([[True, False, True, False, True]])
     kept = [each for each, on in zip(everything, active[0], strict=True) if on]
     start, scale = torch.zeros(1, 3).double(), torch.ones(1).double()
-    some = maximise_slack(program(everything, active), start, scale, -torch.inf, 0.9)
-    only = maximise_slack(program(kept), start, scale, -torch.inf, 0.9)
+    some = maximize_slack(program(everything, active), start, scale, -torch.inf, 0.9)
+    only = maximize_slack(program(kept), start, scale, -torch.inf, 0.9)
     for given, expected in zip(some, only, strict=True):
         torch.testing.assert_close(given, expected, rtol=1e-6, atol=1e-9)
 

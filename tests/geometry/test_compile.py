@@ -17,8 +17,8 @@ from tests.geometry.cases import CASES, FAMILIES, Case
 def test_compiled_gauge_is_the_same(case: Case) -> None:
     way = case.directions(8, torch.float64)
 
-    def gauge(way: Tensor, centre: Tensor, fields: dict[str, Tensor]) -> Tensor:
-        return type(case.sets)(**fields, validate_args=False).eroded().gauge(way, centre)
+    def gauge(way: Tensor, anchor: Tensor, fields: dict[str, Tensor]) -> Tensor:
+        return type(case.sets)(**fields, validate_args=False).eroded().gauge(way, anchor)
 
     torch.compiler.reset()
     compiled = torch.compile(gauge, fullgraph=True, backend="aot_eager", dynamic=False)

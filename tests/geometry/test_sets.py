@@ -14,34 +14,34 @@ pytestmark = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 
 def test_gauge_is_where_the_ray_leaves(case: Case) -> None:
     last = 100.0 if "huge" in case.name else 16.0
-    for centre in case.centres(torch.float64):
+    for anchor in case.anchors(torch.float64):
         way = case.directions(8, torch.float64)
-        gauge = case.sets.gauge(way, centre)
+        gauge = case.sets.gauge(way, anchor)
         leaves = gauge > 1 / last
         assert leaves.any()
-        exit = centre + way / gauge.clamp(min=1 / last).unsqueeze(-1)
+        exit = anchor + way / gauge.clamp(min=1 / last).unsqueeze(-1)
         # Every point before it is inside and the next one outside; so that a part of the set which
         # the ray meets again later does not matter, however short the way between is.
         for share in torch.linspace(0, 1 - 1e-8, 1001, dtype=torch.float64):
-            assert case.sets.contains(centre + (exit - centre) * share).all()
-        assert not case.sets.contains(centre + (exit - centre) * (1 + 1e-8))[leaves].any()
+            assert case.sets.contains(anchor + (exit - anchor) * share).all()
+        assert not case.sets.contains(anchor + (exit - anchor) * (1 + 1e-8))[leaves].any()
 
 
 def test_gauge_is_positively_homogeneous(case: Case) -> None:
     for dtype in DTYPES:
-        sets, centre = case.cast(dtype), case.centres(dtype)[1]
+        sets, anchor = case.cast(dtype), case.anchors(dtype)[1]
         way = case.directions(40, dtype)
         # Powers of two, so that float32 must agree but for squares that leave its range.
         for scale in (2.0**-12, 2.0**10):
-            gauge = sets.gauge(way * scale, centre)
-            torch.testing.assert_close(gauge, scale * sets.gauge(way, centre), rtol=1e-5, atol=0)
+            gauge = sets.gauge(way * scale, anchor)
+            torch.testing.assert_close(gauge, scale * sets.gauge(way, anchor), rtol=1e-5, atol=0)
 
 
 def test_boundary_has_no_slack(case: Case) -> None:
-    for centre in case.centres(torch.float64):
+    for anchor in case.anchors(torch.float64):
         way = case.directions(200, torch.float64)
-        gauge = case.sets.gauge(way, centre)
-        boundary = centre + way / gauge.clamp(min=1e-3).unsqueeze(-1)
+        gauge = case.sets.gauge(way, anchor)
+        boundary = anchor + way / gauge.clamp(min=1e-3).unsqueeze(-1)
         slack = case.sets.slack(boundary)
         reach = 1e-9 * (case.size + boundary.abs().amax(-1))
         assert (slack.abs() <= reach)[gauge > 1e-3].all()
@@ -49,10 +49,10 @@ def test_boundary_has_no_slack(case: Case) -> None:
 
 
 def test_slack_tells_inside_from_outside_and_bounds_the_distance(case: Case) -> None:
-    for centre in case.centres(torch.float64):
+    for anchor in case.anchors(torch.float64):
         action = (
-            centre
-            + case.directions(100, torch.float64) * torch.rand(100, *centre.shape[:-1], 1) * 3
+            anchor
+            + case.directions(100, torch.float64) * torch.rand(100, *anchor.shape[:-1], 1) * 3
         )
         slack = case.sets.slack(action)
         clear = slack.abs() > 1e-9 * case.size
@@ -86,10 +86,10 @@ def test_slack_is_concave_in_convex_sets(case: Case) -> None:
 def test_bounding_box_holds_the_set(case: Case) -> None:
     box = case.sets.bounding_box()
     assert torch.broadcast_shapes(box.batch_shape, case.sets.batch_shape) == case.sets.batch_shape
-    for centre in case.centres(torch.float64):
+    for anchor in case.anchors(torch.float64):
         way = case.directions(400, torch.float64)
-        gauge = case.sets.gauge(way, centre)
-        boundary = centre + way / gauge.clamp(min=1e-3).unsqueeze(-1)
+        gauge = case.sets.gauge(way, anchor)
+        boundary = anchor + way / gauge.clamp(min=1e-3).unsqueeze(-1)
         assert (box.slack(boundary) >= -1e-9 * (case.size + boundary.abs().amax(-1))).all()
 
 
@@ -98,14 +98,14 @@ def test_points_of_the_eroded_set_lie_in_the_set(case: Case, dtype: torch.dtype)
     bounds = case.bounds.with_fields(lambda field, _: field.to(dtype))
     sets = case.cast(dtype)
     way = case.directions(2000 if case.sets.dim <= 6 else 300, dtype)
-    for centre in case.centres(dtype):
-        region = Region((bounds, sets), centre).eroded()
+    for anchor in case.anchors(dtype):
+        region = Region((bounds, sets), anchor).eroded()
         _, gauge = region.outer_and_inner_gauge(way)
         assert (gauge > 0).all()
         for action in (
-            centre + way / gauge.unsqueeze(-1),
-            centre + way * (1 / gauge).unsqueeze(-1),
-            centre + (centre + 3 * way - centre) * (1 / (3 * gauge)).unsqueeze(-1),
+            anchor + way / gauge.unsqueeze(-1),
+            anchor + way * (1 / gauge).unsqueeze(-1),
+            anchor + (anchor + 3 * way - anchor) * (1 / (3 * gauge)).unsqueeze(-1),
         ):
             assert case.sets.contains(action).all()
             assert case.bounds.contains(action).all()
@@ -113,10 +113,10 @@ def test_points_of_the_eroded_set_lie_in_the_set(case: Case, dtype: torch.dtype)
 
 def test_gradients_of_the_gauge_are_those_of_finite_differences(case: Case) -> None:
     way = torch.randn_like(case.inside) * case.size
-    centre = case.inside + 0.5 * way / case.sets.gauge(way, case.inside).clamp(min=1).unsqueeze(-1)
+    anchor = case.inside + 0.5 * way / case.sets.gauge(way, case.inside).clamp(min=1).unsqueeze(-1)
     way = torch.randn_like(case.inside) * case.size
     fields = case.sets.fields()
-    values = {"way": way, "centre": centre, **fields}
+    values = {"way": way, "anchor": anchor, **fields}
     # Differentiate by the logarithm of a factor of each, as sizes differ by 1e6. The zeros above a
     # triangular matrix's diagonal stay zero.
     logs = [torch.zeros_like(value).requires_grad_() for value in values.values()]
@@ -127,7 +127,7 @@ def test_gradients_of_the_gauge_are_those_of_finite_differences(case: Case) -> N
             for (name, value), log in zip(values.items(), logs, strict=True)
         }
         sets = type(case.sets)(**{name: moved[name] for name in fields}, validate_args=False)
-        return sets.gauge(moved["way"], moved["centre"])
+        return sets.gauge(moved["way"], moved["anchor"])
 
     assert torch.autograd.gradcheck(gauge, logs, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-4)
 
@@ -135,9 +135,9 @@ def test_gradients_of_the_gauge_are_those_of_finite_differences(case: Case) -> N
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gradients_are_finite(case: Case, dtype: torch.dtype) -> None:
     sets = case.cast(dtype)
-    for centre in case.centres(dtype):
+    for anchor in case.anchors(dtype):
         way = case.directions(400, dtype).requires_grad_()
-        middle = centre.clone().requires_grad_()
+        middle = anchor.clone().requires_grad_()
         gauge = sets.gauge(way, middle)
         assert gauge.isfinite().all()
         for gradient in torch.autograd.grad(gauge.sum(), (way, middle)):
@@ -145,17 +145,17 @@ def test_gradients_are_finite(case: Case, dtype: torch.dtype) -> None:
 
 
 def test_around_has_the_fields_shapes_and_contains_the_ball(case: Case) -> None:
-    centre = 5 * torch.randn(*case.inside.shape, dtype=torch.float64)
+    anchor = 5 * torch.randn(*case.inside.shape, dtype=torch.float64)
     radius = torch.tensor(3.0, dtype=torch.float64)
-    around = case.sets.around(centre, radius)
+    around = case.sets.around(anchor, radius)
     around.validate()
     way = case.directions(100, torch.float64)
-    on_sphere = centre + (1 - 1e-9) * radius * way / way.norm(dim=-1, keepdim=True)
+    on_sphere = anchor + (1 - 1e-9) * radius * way / way.norm(dim=-1, keepdim=True)
     assert around.contains(on_sphere).all()
     nowhere = torch.zeros(case.sets.batch_shape, dtype=torch.bool)
-    dropped = case.sets.unless_dropped(nowhere, centre, radius)
+    dropped = case.sets.unless_dropped(nowhere, anchor, radius)
     assert dropped.contains(on_sphere).all()
-    kept = case.sets.unless_dropped(~nowhere, centre, radius)
+    kept = case.sets.unless_dropped(~nowhere, anchor, radius)
     assert (kept.slack(case.inside) == case.sets.slack(case.inside)).all()
     mixed = case.sets.where(nowhere, around)
     for name, field in case.sets.fields().items():
@@ -164,7 +164,7 @@ def test_around_has_the_fields_shapes_and_contains_the_ball(case: Case) -> None:
         assert given.shape[given.ndim - event :] == field.shape[field.ndim - event :]
     way = case.directions(10, torch.float64).requires_grad_()
     for each in (mixed, dropped):
-        gauge = each.gauge(way, centre)
+        gauge = each.gauge(way, anchor)
         assert gauge.isfinite().all()
         assert torch.autograd.grad(gauge.sum(), way)[0].isfinite().all()
 

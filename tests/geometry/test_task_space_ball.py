@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cnfp_torchrl.geometry import Ball, Box, Ellipsoid, TaskSpaceBall, lexicographic_centre
+from cnfp_torchrl.geometry import Ball, Box, Ellipsoid, TaskSpaceBall, lexicographic_anchor
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -17,10 +17,10 @@ def test_an_invertible_map_makes_an_ellipsoid() -> None:
     offset = -(inverse @ center.unsqueeze(-1)).squeeze(-1)
     ball = TaskSpaceBall(inverse, offset, torch.ones(5).double())
     ellipsoid = Ellipsoid(center, tril)
-    centre = center + 0.1 * (tril @ torch.randn(5, 3, 1).double()).squeeze(-1)
+    anchor = center + 0.1 * (tril @ torch.randn(5, 3, 1).double()).squeeze(-1)
     way = torch.randn(100, 5, 3).double()
-    torch.testing.assert_close(ball.gauge(way, centre), ellipsoid.gauge(way, centre))
-    torch.testing.assert_close(ball.slack(centre + way), ellipsoid.slack(centre + way))
+    torch.testing.assert_close(ball.gauge(way, anchor), ellipsoid.gauge(way, anchor))
+    torch.testing.assert_close(ball.slack(anchor + way), ellipsoid.slack(anchor + way))
 
 
 def test_some_rows_of_the_identity_make_a_ball_in_these_components() -> None:
@@ -59,9 +59,9 @@ def test_a_jacobian_of_zero_allows_all_or_nothing(offset: float, holds: bool) ->
     actions = torch.randn(20, 3, dtype=torch.float64)
     assert (ball.contains(actions) == holds).all()
     assert ((ball.slack(actions) > 0) == holds).all()
-    centre, active = lexicographic_centre([Box(-ones, ones), ball])
+    anchor, active = lexicographic_anchor([Box(-ones, ones), ball])
     assert active.tolist() == [True, holds]
-    assert (ball.gauge(actions, centre) == 0).all()
+    assert (ball.gauge(actions, anchor) == 0).all()
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1e-20, 1e-10, 1.0, 1e10, 1e25])
@@ -70,6 +70,6 @@ def test_the_unit_of_the_image_does_not_matter(unit: float) -> None:
     here = TaskSpaceBall(jacobian, offset, torch.tensor(0.2))
     there = TaskSpaceBall(unit * jacobian, unit * offset, torch.tensor(0.2 * unit))
     way = torch.randn(100, 2)
-    for centre in (torch.zeros(2), torch.tensor([0.05, -0.1])):
-        torch.testing.assert_close(there.gauge(way, centre), here.gauge(way, centre))
-        torch.testing.assert_close(there.slack(centre + way), here.slack(centre + way))
+    for anchor in (torch.zeros(2), torch.tensor([0.05, -0.1])):
+        torch.testing.assert_close(there.gauge(way, anchor), here.gauge(way, anchor))
+        torch.testing.assert_close(there.slack(anchor + way), here.slack(anchor + way))

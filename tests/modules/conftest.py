@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, SafeProbabilisticTensorDictSequential, TanhNormal
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import gaussian_network
 
@@ -29,7 +30,7 @@ STATES = [
     ((0.6, 0.6), 100),
     ((-0.6, -0.5), 90),
 ]
-CENTRE = 0.0, 0.0  # of the rectangle, where the obstacle constraint cannot hold
+ANCHOR = 0.0, 0.0  # of the rectangle, where the obstacle constraint cannot hold
 
 ActorFactory = Callable[..., SafeProbabilisticTensorDictSequential]
 
@@ -37,7 +38,7 @@ ActorFactory = Callable[..., SafeProbabilisticTensorDictSequential]
 def make_env(batch_size: tuple[int, ...] = (len(STATES),), **options: int) -> TransformedEnv:
     geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
     base = PointNavEnv(batch_size, seed=0, **options)
-    return make_environment(base, geometries, order=ORDER, with_centre=True)
+    return make_environment(base, geometries, order=ORDER, with_anchor=True)
 
 
 @pytest.fixture

@@ -30,13 +30,7 @@ from torchrl.modules import (
     ValueOperator,
 )
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    ObstacleGeometry,
-    PointNavEnv,
-    constrain_env,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import constrain_env, constraint_bijectors
 from cnfp_torchrl.geometry import Ball
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
@@ -48,6 +42,7 @@ from cnfp_torchrl.modules import (
     make_constrained_actor,
     with_reference_entropy,
 )
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 MakeActor = Callable[..., Any]
 Inside = Callable[[TensorDictBase], dict[str, Tensor]]

@@ -10,8 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import gaussian_network
 
@@ -59,7 +60,7 @@ def _make_env(seed: int) -> TransformedEnv:
     geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
     order = ["battery", "obstacle"]
     return make_environment(
-        PointNavEnv((AGENTS,), seed=seed), geometries, order=order, with_centre=True
+        PointNavEnv((AGENTS,), seed=seed), geometries, order=order, with_anchor=True
     )
 
 

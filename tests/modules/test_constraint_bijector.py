@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
-from cnfp_torchrl.bijectors import BijectorChain
+from cnfp_torchrl.bijectors import SquashChain
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, HalfSpaces
 from cnfp_torchrl.modules import ConstraintBijector
@@ -74,7 +74,7 @@ def test_chained_modules_score_as_the_distribution_of_the_chain(keys: tuple[str,
     state = published(**names)
     latent = torch.randn(BATCH, DIM, dtype=torch.float64)
     base = Independent(Normal(torch.zeros_like(latent), torch.ones_like(latent)), 1)
-    flow = ConstrainedFlow(base, BijectorChain([each.get_transform(state) for each in modules]))
+    flow = ConstrainedFlow(base, SquashChain([each.get_transform(state) for each in modules]))
 
     state[sample_key] = latent
     for module in modules:

@@ -14,19 +14,19 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.bijectors import (
-    AlignedSquash,
-    BijectorChain,
     BoxSquash,
+    ExactSquash,
     GaugeSquash,
     NoDensityError,
     Projection,
     RadialSquash,
+    SquashChain,
 )
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     Flow,
-    PaperChain,
     ProjectionFlow,
+    SquashFlow,
     constrain,
     flow_head,
     make_constrained_actor,
@@ -34,7 +34,7 @@ from cnfp_torchrl.modules import (
 )
 from cnfp_torchrl.modules.flow_module import action_bounds
 
-FLOWS = ["exact", "gauge", "radial", "squash", "none"]
+FLOWS = ["exact", "gauge", "radial", "squash", "unconstrained"]
 EXACT_FLOWS = ["exact", "gauge", "radial"]
 SAFE_FLOWS = [*EXACT_FLOWS, "projection"]  # the last without a density
 EXPLORATION_TYPES = [
@@ -82,11 +82,11 @@ def doubled(tensordict: TensorDictBase) -> TensorDictBase:
 @pytest.mark.parametrize(
     ("flow", "reads"),
     [
-        ("exact", {"center", "radius", "low", "high", "active", "centre"}),
-        ("radial", {"center", "radius", "low", "high", "active", "centre"}),
-        ("projection", {"center", "radius", "low", "high", "active", "centre"}),
+        ("exact", {"center", "radius", "low", "high", "active", "anchor"}),
+        ("radial", {"center", "radius", "low", "high", "active", "anchor"}),
+        ("projection", {"center", "radius", "low", "high", "active", "anchor"}),
         ("squash", {"center", "radius", "low", "high"}),
-        ("none", set()),
+        ("unconstrained", set()),
     ],
 )
 def test_in_keys_are_what_the_flow_needs(
@@ -106,7 +106,7 @@ def test_each_missing_entry_is_named(
 ) -> None:
     actor = make_actor(flow=flow)
     for key in actor.in_keys[1:]:
-        remedy = "ConstraintCentre" if key[-1] in ("centre", "active") else key[1]
+        remedy = "ConstraintAnchor" if key[-1] in ("anchor", "active") else key[1]
         message = re.escape(f"expected {key}, found keys [") + f".*append.*{remedy}"
         with pytest.raises(KeyError, match=message):
             actor(state.exclude(key))
@@ -115,15 +115,15 @@ def test_each_missing_entry_is_named(
 @pytest.mark.parametrize(
     ("flow", "kind"),
     [
-        ("exact", AlignedSquash),
+        ("exact", ExactSquash),
         ("gauge", GaugeSquash),
         ("radial", RadialSquash),
         ("projection", Projection),
-        ("squash", BijectorChain),
-        ("none", BoxSquash),
-        (PaperChain(max_radius=0.5), BijectorChain),
+        ("squash", SquashChain),
+        ("unconstrained", BoxSquash),
+        (SquashFlow(max_radius=0.5), SquashChain),
     ],
-    ids=["exact", "gauge", "radial", "projection", "squash", "none", "object"],
+    ids=["exact", "gauge", "radial", "projection", "squash", "unconstrained", "object"],
 )
 def test_flows_by_name_and_as_objects(
     make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type
@@ -134,7 +134,7 @@ def test_flows_by_name_and_as_objects(
 
 
 def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
-    names = ["exact", "gauge", "radial", "squash", "projection", "none"]
+    names = ["exact", "gauge", "radial", "squash", "projection", "unconstrained"]
     message = re.escape(f"flow: expected one of {names} or a Flow, given 'gage'")
     with pytest.raises(ValueError, match=message):
         make_actor(flow="gage")
@@ -143,7 +143,7 @@ def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
 @pytest.mark.parametrize("radius", [0.0, -1.0, float("nan")])
 def test_the_paper_chain_needs_a_radius(radius: float) -> None:
     with pytest.raises(ValueError, match="max_radius: expected a number > 0, given"):
-        PaperChain(max_radius=radius)
+        SquashFlow(max_radius=radius)
 
 
 @pytest.mark.parametrize("rounds", [0, -3])
@@ -179,7 +179,7 @@ def test_exact_flows_stay_inside_whatever_the_network(
     ("flow", "held", "broken"),
     [
         pytest.param("squash", "obstacle", "battery", id="the last set of the paper's chain"),
-        pytest.param("none", "bounds", "obstacle", id="the bounds alone"),
+        pytest.param("unconstrained", "bounds", "obstacle", id="the bounds alone"),
     ],
 )
 def test_the_other_flows_keep_what_they_promise_and_no_more(
@@ -218,7 +218,7 @@ def test_stages_have_names_and_end_in_the_action(
 ) -> None:
     for order in (["battery", "obstacle"], ["obstacle", "battery"]):
         head = flow_head(make_actor(flow=flow, order=order))
-        expected = {"squash": order, "none": ["bounds"]}.get(flow, ["bounds", *order])
+        expected = {"squash": order, "unconstrained": ["bounds"]}.get(flow, ["bounds", *order])
         assert head.order == order
         assert head.stage_names == expected
         latent = torch.randn(8, 2)
@@ -291,7 +291,11 @@ def test_saturated_samples_have_finite_log_probs(
 
 def test_a_log_prob_key_of_ones_own(env: TransformedEnv, state: TensorDictBase) -> None:
     head = ConstrainedFlowModule(
-        env.action_spec_unbatched, [], flow="none", return_log_prob=True, log_prob_key="score"
+        env.action_spec_unbatched,
+        [],
+        flow="unconstrained",
+        return_log_prob=True,
+        log_prob_key="score",
     )
     out = head(state.set("loc", torch.zeros(8, 2)).set("scale", torch.ones(8, 2)))
     assert head.out_keys == ["action", "score"]
@@ -318,7 +322,7 @@ def test_the_projection_agrees_with_tanh_where_nothing_binds(
     torch.manual_seed(1)
     projected = make_actor(flow="projection")(state.clone())["action"]
     torch.manual_seed(1)
-    plain = make_actor(flow="none")(state.clone())
+    plain = make_actor(flow="unconstrained")(state.clone())
     allowed = flow_head(make_actor()).get_region(state).slack(plain["action"]) > 1e-4
     assert allowed.any()
     assert not allowed.all()

@@ -35,7 +35,7 @@ def acted(env: TransformedEnv) -> TensorDictBase:
     Each set is left by some actions that are inside the two others.
     """
     state = env.reset(position=(0.35, 0.25), battery=28)
-    return state.set("action", state["constraints", "centre"].clone())
+    return state.set("action", state["constraints", "anchor"].clone())
 
 
 def set_action(acted: TensorDictBase, action: Tensor) -> TensorDictBase:
@@ -168,7 +168,7 @@ def test_guarded_actors_are_really_guarded(make_actor: MakeActor, state: TensorD
         policy(state)
 
 
-@pytest.mark.parametrize("flow", ["squash", "none"])
+@pytest.mark.parametrize("flow", ["squash", "unconstrained"])
 def test_flows_without_a_guarantee_are_not_guarded(make_actor: MakeActor, flow: str) -> None:
     actor = make_actor(flow=flow)
     assert guarded(actor) is actor

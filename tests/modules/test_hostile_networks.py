@@ -36,12 +36,12 @@ def test_no_violations_at_all(flow: str, name: str) -> None:
     assert row.steps == 20_000
     assert row.violations == {"obstacle": 0, "battery": 0}
     assert row.drops == {"obstacle": 0, "battery": 0}
-    assert row.minimum_centre_slack >= 0.025
+    assert row.minimum_anchor_slack >= 0.025
 
 
 def test_without_constraints_the_same_count_is_not_zero() -> None:
     hostile = experiment.NETWORKS["0, scale 1e4"]
-    row = experiment.run("none", "", hostile, steps=2_000, agents=50, seed=1)
+    row = experiment.run("unconstrained", "", hostile, steps=2_000, agents=50, seed=1)
     assert all(count > 100 for count in row.violations.values())
     assert all(count > 100 for count in row.drops.values())
 
@@ -80,8 +80,8 @@ def test_the_command_writes_both_files_and_fails_on_violations(
     rows = output.with_suffix(".md").read_text().count("| untrained, default | 400 | 0 | 0 |")
     assert rows >= len(experiment.SAFE_FLOWS)
 
-    monkeypatch.setattr(experiment, "FLOWS", ("none",))
-    monkeypatch.setattr(experiment, "SAFE_FLOWS", ("none",))
+    monkeypatch.setattr(experiment, "FLOWS", ("unconstrained",))
+    monkeypatch.setattr(experiment, "SAFE_FLOWS", ("unconstrained",))
     with pytest.raises(SystemExit, match="violations, of which there should be none"):
         experiment.main()
     assert json.loads(output.read_text())["rows"][0]["violations"]["obstacle"] > 0

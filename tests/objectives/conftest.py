@@ -8,8 +8,9 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ValueOperator
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import action_value_network, gaussian_network
 
@@ -20,7 +21,7 @@ MakeActor = Callable[..., Any]
 def env() -> TransformedEnv:
     geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
     order = ["battery", "obstacle"]
-    return make_environment(PointNavEnv((64,), seed=0), geometries, order=order, with_centre=True)
+    return make_environment(PointNavEnv((64,), seed=0), geometries, order=order, with_anchor=True)
 
 
 @pytest.fixture

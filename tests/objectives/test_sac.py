@@ -23,7 +23,7 @@ MakeActor = Callable[..., Any]
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 # The radial squash has no stage 0 of its own; its reference is the squash onto the bounds.
-FLOWS = ["exact", "radial", "squash", "none"]
+FLOWS = ["exact", "radial", "squash", "unconstrained"]
 
 LOSSES: dict[str, Callable[..., SACLoss]] = {
     "torchrl": SACLoss,
@@ -170,7 +170,7 @@ def test_projected_actions_learn_by_the_reference_entropy(
     # The entropy rewarded is that of the tanh-squashed Gaussian, whatever is projected.
     state = actor(transitions.clone())
     projected = flow_head(with_reference_entropy(actor)).get_dist(state)
-    unprojected = flow_head(make_actor(flow="none")).get_dist(state)
+    unprojected = flow_head(make_actor(flow="unconstrained")).get_dist(state)
     torch.manual_seed(1)
     expected = unprojected.rsample_and_log_prob()[1]
     torch.manual_seed(1)
@@ -196,10 +196,10 @@ def test_the_entropy_of_projected_actions_is_refused(
 
 
 def share(actor: Any, transitions: TensorDictBase, latent: Tensor) -> Tensor:
-    """s, by which the retractions shorten the way from the centre, from the stages' positions."""
+    """s, by which the retractions shorten the way from the anchor, from the stages' positions."""
     stages = flow_head(actor).get_bijector(transitions).stages(latent).actions
-    centre = transitions["constraints", "centre"]
-    return vector_norm(stages[-1] - centre, dim=-1) / vector_norm(stages[0] - centre, dim=-1)
+    anchor = transitions["constraints", "anchor"]
+    return vector_norm(stages[-1] - anchor, dim=-1) / vector_norm(stages[0] - anchor, dim=-1)
 
 
 def test_the_reference_leaves_the_retractions_out(
@@ -262,7 +262,7 @@ def test_the_loss_rewards_the_entropy_that_was_chosen(
     )
 
 
-@pytest.mark.parametrize("flow", ["squash", "none"])
+@pytest.mark.parametrize("flow", ["squash", "unconstrained"])
 def test_without_retractions_the_entropies_agree(
     env: TransformedEnv,
     make_actor: MakeActor,
@@ -296,7 +296,7 @@ def test_the_discount_is_used(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"entropy": "none"}, "entropy: expected 'reference' or 'action', given 'none'"),
+        ({"entropy": "unconstrained"}, "entropy: expected 'reference' or 'action', given 'none'"),
         ({"gamma": 1.0}, r"gamma: expected a discount in \[0, 1\), given 1.0"),
         ({"gamma": -0.1}, r"gamma: expected a discount in \[0, 1\), given -0.1"),
         ({"gamma": float("nan")}, r"gamma: expected a discount in \[0, 1\), given nan"),

@@ -143,7 +143,7 @@ def plain_losses(
 
 @pytest.mark.parametrize("nets", [1, 3])
 @pytest.mark.parametrize("entropy", ["reference", "action"])
-@pytest.mark.parametrize("flow", ["exact", "none"])
+@pytest.mark.parametrize("flow", ["exact", "unconstrained"])
 @pytest.mark.parametrize("deactivate_vmap", [False, True])
 def test_values_and_gradients_are_those_of_the_formulas(
     make_actor: MakeActor,
@@ -363,9 +363,9 @@ def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDict
         ({"lambda_init": 200.0}, r"lambda_init: expected .*lambda_max = 100.0\], given 200.0"),
         ({"lambda_init": 0.0}, "lambda_init: expected a number in .* given 0.0"),
         ({"num_cost_nets": 0}, "num_cost_nets: expected a number >= 1, given 0"),
-        ({"reduction": "none"}, "reduction: expected 'mean' or 'sum', given 'none'"),
+        ({"reduction": "unconstrained"}, "reduction: expected 'mean' or 'sum', given 'none'"),
         ({"skip_done_states": True}, "skip_done_states: expected it left out"),
-        ({"entropy": "none"}, "entropy: expected 'reference' or 'action', given 'none'"),
+        ({"entropy": "unconstrained"}, "entropy: expected 'reference' or 'action', given 'none'"),
     ],
 )
 def test_bad_settings_are_refused(

@@ -7,8 +7,8 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from cnfp_torchrl.envs import Layout, ShortestPath
-from cnfp_torchrl.envs.shortest_path import CAUTIOUS
+from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
+from cnfp_torchrl.tasks.point_nav.shortest_path import CAUTIOUS
 from cnfp_torchrl.training.agent import build_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
@@ -25,7 +25,7 @@ from tests.training.conftest import TINY
 MakeConfig = Callable[..., DictConfig]
 
 
-@pytest.fixture(params=["exact", "none"])
+@pytest.fixture(params=["exact", "unconstrained"])
 def run(request: pytest.FixtureRequest, make_config: MakeConfig, tmp_path: Path) -> RunFolder:
     """A run of hardly any training: its policy knows nothing of any constraint."""
     folder = RunFolder.create(tmp_path / "run")

@@ -17,11 +17,11 @@ from cnfp_torchrl.geometry.constraint_set import Gauge
 class PlainBall(Ball):
     """A ball of which each method is its own, so that a broken one breaks nothing else."""
 
-    def gauge_about(self, centre: Tensor) -> Gauge:
-        return lambda direction: self.gauge(direction, centre)
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        return lambda direction: self.gauge(direction, anchor)
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return Ball(self.center, self.radius, validate_args=False).gauge(direction, centre)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return Ball(self.center, self.radius, validate_args=False).gauge(direction, anchor)
 
     def superlevel(self) -> Any:
         return None
@@ -30,27 +30,27 @@ class PlainBall(Ball):
 
 
 class GaugeOfTheWrongSign(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return super().gauge(-direction, centre)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return super().gauge(-direction, anchor)
 
 
 class GaugeAboutTheMiddle(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return vector_norm(direction, dim=-1) / self.radius
 
 
-class CancellingGauge(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        w = centre - self.center
+class CancelingGauge(PlainBall):
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        w = anchor - self.center
         b, k = (direction * w).sum(-1), self.radius**2 - (w * w).sum(-1)
         return (b + (b * b + (direction * direction).sum(-1) * k).sqrt()) / k
 
 
-class CancellingOnTheWayBack(PlainBall):
+class CancelingOnTheWayBack(PlainBall):
     """It subtracts where the direction leads away from the boundary only."""
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        w = centre - self.center
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        w = anchor - self.center
         distance = vector_norm(w, dim=-1)
         k = (self.radius - distance) * (self.radius + distance)
         b = (direction * w).sum(-1)
@@ -58,47 +58,47 @@ class CancellingOnTheWayBack(PlainBall):
 
 
 class GaugeThatIsNotHomogeneous(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return super().gauge(direction, centre) + 1e-9
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return super().gauge(direction, anchor) + 1e-9
 
 
 class GaugeOfFourthPowers(PlainBall):
     """Right, but the powers of short directions are no numbers that float32 has."""
 
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         length = direction.pow(4).sum(-1).pow(0.25)
-        return super().gauge(direction / length.unsqueeze(-1), centre) * length
+        return super().gauge(direction / length.unsqueeze(-1), anchor) * length
 
 
 class GaugeWithNanAtKinks(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         # Zero, but for the gradient.
         length = (direction * direction).sqrt().sum(-1)
-        return super().gauge(direction, centre) + 0 * length
+        return super().gauge(direction, anchor) + 0 * length
 
 
 class GaugeWithoutGradient(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return super().gauge(direction.detach(), centre) + 0 * direction.sum(-1)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return super().gauge(direction.detach(), anchor) + 0 * direction.sum(-1)
 
 
 class GaugeThatMixesTheBatch(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return direction.norm(dim=-1) / (self.radius - (centre - self.center).norm()).min()
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return direction.norm(dim=-1) / (self.radius - (anchor - self.center).norm()).min()
 
 
 class GaugeOfTheWrongShape(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return super().gauge(direction, centre).unsqueeze(-1)
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return super().gauge(direction, anchor).unsqueeze(-1)
 
 
 class GaugeThatRaises(PlainBall):
-    def gauge(self, direction: Tensor, centre: Tensor) -> Tensor:
-        return direction @ centre
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return direction @ anchor
 
 
-class GaugeAboutOfAnotherCentre(PlainBall):
-    def gauge_about(self, centre: Tensor) -> Gauge:
+class GaugeAboutOfAnotherAnchor(PlainBall):
+    def gauge_about(self, anchor: Tensor) -> Gauge:
         return lambda direction: self.gauge(direction, self.center)
 
 
@@ -108,7 +108,7 @@ class NoErosion(PlainBall):
 
 
 class ErosionOfTheRadiusAlone(PlainBall):
-    """Not of the centre, which may be the larger number."""
+    """Not of the anchor, which may be the larger number."""
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = torch.finfo(self.dtype).eps
@@ -162,34 +162,34 @@ class ContainsTheOpenOutside(PlainBall):
 
 
 class AroundTooSmall(PlainBall):
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        return super().around(centre, 0.9 * radius)
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        return super().around(center, 0.9 * radius)
 
 
 class AroundTooSmallIfLarge(PlainBall):
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        return super().around(centre, torch.where(self.radius > 1.9, 0.9, 1.0) * radius)
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        return super().around(center, torch.where(self.radius > 1.9, 0.9, 1.0) * radius)
 
 
 class AroundItself(PlainBall):
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         return type(self)(self.center, self.radius + radius, validate_args=False)
 
 
 class AroundOfAnotherShape(PlainBall):
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
-        return type(self)(centre, radius.unsqueeze(-1), validate_args=False)
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        return type(self)(center, radius.unsqueeze(-1), validate_args=False)
 
 
 class AroundNotWritten(PlainBall):
-    def around(self, centre: Tensor, radius: Tensor) -> Self:
+    def around(self, center: Tensor, radius: Tensor) -> Self:
         raise NotImplementedError("around")
 
 
 class DroppedByInfinity(PlainBall):
     """Infinite radii do not bind, but their gradients are no numbers."""
 
-    def unless_dropped(self, active: Tensor, centre: Tensor, radius: Tensor) -> Self:
+    def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
         wide = torch.where(active, self.radius, torch.inf)
         return type(self)(self.center, wide, validate_args=False)
 
@@ -220,12 +220,12 @@ class PartThatIgnoresThePoint(VisibleRegion):
 
 
 class ViolationsOfTheExample(PlainBall):
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "radius", self.radius > 0, "a negative radius"
 
 
 class ViolationsOfNoField(PlainBall):
-    def violations(self) -> Iterator[tuple[str, Tensor, str]]:
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "size", self.radius <= 0, "a size > 0"
 
 
@@ -233,7 +233,7 @@ class EventDimsOfTheRadius(PlainBall):
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 1}
 
 
-class EventDimsOfTheCentre(PlainBall):
+class EventDimsOfTheAnchor(PlainBall):
     event_dims: ClassVar[Mapping[str, int]] = {"center": 0, "radius": 0}
 
 
@@ -259,8 +259,8 @@ class NoEventDims(ConstraintSet):
 BROKEN: list[tuple[type[ConstraintSet], str]] = [
     (GaugeOfTheWrongSign, "gauge"),
     (GaugeAboutTheMiddle, "gauge"),
-    (CancellingGauge, "gauge"),
-    (CancellingOnTheWayBack, "gauge"),
+    (CancelingGauge, "gauge"),
+    (CancelingOnTheWayBack, "gauge"),
     (GaugeThatIsNotHomogeneous, "gauge"),
     (GaugeOfFourthPowers, "gauge"),
     (GaugeWithNanAtKinks, "gauge"),
@@ -268,7 +268,7 @@ BROKEN: list[tuple[type[ConstraintSet], str]] = [
     (GaugeThatMixesTheBatch, "gauge"),
     (GaugeOfTheWrongShape, "gauge"),
     (GaugeThatRaises, "gauge"),
-    (GaugeAboutOfAnotherCentre, "gauge_about"),
+    (GaugeAboutOfAnotherAnchor, "gauge_about"),
     (NoErosion, "eroded"),
     (ErosionOfTheRadiusAlone, "eroded"),
     (ErosionByAShare, "eroded"),
@@ -291,7 +291,7 @@ BROKEN: list[tuple[type[ConstraintSet], str]] = [
     (ViolationsOfTheExample, "violations"),
     (ViolationsOfNoField, "violations"),
     (EventDimsOfTheRadius, "event_dims"),
-    (EventDimsOfTheCentre, "event_dims"),
+    (EventDimsOfTheAnchor, "event_dims"),
     (EventDimsAsATuple, "event_dims"),
     (EventDimsOfOtherFields, "event_dims"),
     (NoEventDims, "event_dims"),

@@ -12,7 +12,7 @@ from cnfp_torchrl.testing import FamilyError, check_constraint_set
 from tests.testing.broken import (
     BROKEN,
     AroundTooSmallIfLarge,
-    CancellingGauge,
+    CancelingGauge,
     GaugeAboutTheMiddle,
     PartThatIgnoresThePoint,
     PlainBall,
@@ -47,7 +47,7 @@ def test_the_message_says_where() -> None:
     with pytest.raises(FamilyError) as caught:
         check_constraint_set(sets, INSIDE)
     message = str(caught.value)
-    assert "GaugeAboutTheMiddle.gauge: expected all before centre + direction / gauge" in message
+    assert "GaugeAboutTheMiddle.gauge: expected all before anchor + direction / gauge" in message
     numbers = {
         name: torch.tensor([float(x) for x in re.findall(r"[-+.\de]+", given)])
         for name, given in re.findall(r"\n    (\w+) = (.*)", message)
@@ -55,10 +55,10 @@ def test_the_message_says_where() -> None:
     element = int(re.findall(r"element (\d) of", message)[0])
     torch.testing.assert_close(numbers["center"], CENTER[element])
     torch.testing.assert_close(numbers["radius"][0], RADIUS[element])
-    torch.testing.assert_close(numbers["centre"], INSIDE[element])
+    torch.testing.assert_close(numbers["anchor"], INSIDE[element])
     action = (
-        numbers["centre"]
-        + numbers["direction"] / sets.gauge(numbers["direction"], numbers["centre"]).amax()
+        numbers["anchor"]
+        + numbers["direction"] / sets.gauge(numbers["direction"], numbers["anchor"]).amax()
     )
     assert sets.select(RADIUS.shape, torch.tensor(element)).slack(action).abs() > 1e-3
 
@@ -72,13 +72,13 @@ def test_a_part_of_a_set_that_is_not_convex_has_to_heed_the_point() -> None:
 
 
 def test_a_batch_of_one_and_a_single_set_will_do() -> None:
-    for sets, centre in (
-        (CancellingGauge(CENTER[:1], RADIUS[:1]), INSIDE[:1]),
-        (CancellingGauge(CENTER[0], RADIUS[0]), INSIDE[0]),
-        (CancellingGauge(torch.zeros(2), torch.tensor(1.0)), torch.zeros(2)),
+    for sets, anchor in (
+        (CancelingGauge(CENTER[:1], RADIUS[:1]), INSIDE[:1]),
+        (CancelingGauge(CENTER[0], RADIUS[0]), INSIDE[0]),
+        (CancelingGauge(torch.zeros(2), torch.tensor(1.0)), torch.zeros(2)),
     ):
-        with pytest.raises(FamilyError, match=r"CancellingGauge\.gauge: expected a float32 exit"):
-            check_constraint_set(sets, centre)
+        with pytest.raises(FamilyError, match=r"CancelingGauge\.gauge: expected a float32 exit"):
+            check_constraint_set(sets, anchor)
 
 
 def test_batch_elements_are_named_by_their_index() -> None:

@@ -11,7 +11,7 @@ from cnfp_torchrl import testing
 from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.testing import FamilyError, check_constraint_set, checker
 from tests.geometry.cases import CASES, DTYPES
-from tests.testing.broken import CancellingGauge, PlainBall
+from tests.testing.broken import CancelingGauge, PlainBall
 
 BALL = PlainBall(torch.tensor([0.5, -0.25]), torch.tensor(0.75))
 INSIDE = torch.tensor([0.25, 0.0])
@@ -32,7 +32,7 @@ def test_global_random_numbers_are_left_alone() -> None:
 
 
 def test_the_same_seed_finds_the_same() -> None:
-    sets = CancellingGauge(**BALL.fields())
+    sets = CancelingGauge(**BALL.fields())
     messages = []
     for seed in (0, 0, 1):
         torch.rand(7)
@@ -49,22 +49,22 @@ def test_gradients_outside_do_not_matter() -> None:
     assert radius.grad is None
 
 
-def test_a_centre_outside_is_named() -> None:
-    with pytest.raises(FamilyError, match=r"PlainBall\.slack: .*or a centre inside the set"):
+def test_a_anchor_outside_is_named() -> None:
+    with pytest.raises(FamilyError, match=r"PlainBall\.slack: .*or an anchor inside the set"):
         check_constraint_set(BALL, torch.tensor([2.0, 0.0]))
 
 
-def test_a_centre_of_another_width_is_named() -> None:
-    with pytest.raises(FamilyError, match="expected the centre's action dimension, 3, given 2"):
+def test_a_anchor_of_another_width_is_named() -> None:
+    with pytest.raises(FamilyError, match="expected the anchor's action dimension, 3, given 2"):
         check_constraint_set(BALL, torch.zeros(3))
 
 
-def test_a_centre_of_another_dtype_is_refused() -> None:
-    with pytest.raises(ValueError, match="centre: expected the dtype of the sets"):
+def test_a_anchor_of_another_dtype_is_refused() -> None:
+    with pytest.raises(ValueError, match="anchor: expected the dtype of the sets"):
         check_constraint_set(BALL, INSIDE.double())
 
 
-def test_bounds_have_to_be_finite_and_hold_the_centre() -> None:
+def test_bounds_have_to_be_finite_and_hold_the_anchor() -> None:
     for low, high in ((1.0, 2.0), (-1.0, torch.inf)):
         bounds = Box(low * torch.ones(2), high * torch.ones(2))
         with pytest.raises(ValueError, match="bounds: expected finite action bounds"):
@@ -72,7 +72,7 @@ def test_bounds_have_to_be_finite_and_hold_the_centre() -> None:
 
 
 def test_every_check_is_made_and_listed() -> None:
-    made = {*checker.OF_SHAPES, *checker.ABOUT_THE_GIVEN_CENTRE, *checker.ABOUT_ALL_CENTRES}
+    made = {*checker.OF_SHAPES, *checker.ABOUT_THE_GIVEN_ANCHOR, *checker.ABOUT_ALL_ANCHORS}
     modules = (checker.shapes, checker.slacks, checker.gauges, checker.flows)
     written = {
         function

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cnfp_torchrl.envs import ConstraintCentre, GeometryTransform, constraint_bijectors
+from cnfp_torchrl.audit import AuditReport, AuditSettings, Findings, Share, as_text, audit
+from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball
-from cnfp_torchrl.training.audit import AuditReport, AuditSettings, Findings, Share, as_text, audit
 from cnfp_torchrl.visual.audit_figure import audit_figure
 
 LOWEST = 0.5
@@ -81,7 +81,7 @@ class Share_(GeometryTransform):
 
 def with_geometry(base: EnvBase, geometry: GeometryTransform) -> TransformedEnv:
     env = TransformedEnv(base, geometry)
-    return env.append_transform(ConstraintCentre(constraint_bijectors(env)))
+    return env.append_transform(ConstraintAnchor(constraint_bijectors(env)))
 
 
 def of(report: AuditReport, source: str, name: str = "disc") -> Findings:
@@ -275,7 +275,7 @@ def test_own_indicators_judge() -> None:
 def test_a_constraint_without_indicator_is_not_judged() -> None:
     env = TransformedEnv(Disc(256), Share_(0.8))
     env.append_transform(Share_(0.9, name="second"))
-    env.append_transform(ConstraintCentre(constraint_bijectors(env)))
+    env.append_transform(ConstraintAnchor(constraint_bijectors(env)))
     report = audit(env, place=place, settings=AuditSettings(states=16, actions=16, steps=5))
     found = of(report, "uniform", "second")
     assert found.unsound is found.coverage is found.possible is None
@@ -290,7 +290,7 @@ def test_wrong_environments_are_explained() -> None:
         audit(Disc(4))
     with pytest.raises(ValueError, match=r"key 'cost': expected \(4, 1\).*given none"):
         audit(with_geometry(Disc(4, cost=False), Share_(0.8)))
-    with pytest.raises(KeyError, match="ConstraintCentre"):
+    with pytest.raises(KeyError, match="ConstraintAnchor"):
         audit(TransformedEnv(Disc(4), Share_(0.8)), settings=AuditSettings(steps=1))
 
 

@@ -12,17 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    ConstraintCentre,
-    GeometryTransform,
-    Layout,
-    ObstacleGeometry,
-    PointNavEnv,
-    constraint_bijectors,
-)
-from cnfp_torchrl.geometry import Ball, Box
-from cnfp_torchrl.training.audit import (
+from cnfp_torchrl.audit import (
     FLAWS_FOUND,
     AuditReport,
     AuditSettings,
@@ -31,6 +21,9 @@ from cnfp_torchrl.training.audit import (
     audit_configured,
     main,
 )
+from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
+from cnfp_torchrl.geometry import Ball, Box
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.audit_figure import audit_figure, save_audit
 
@@ -44,7 +37,7 @@ def audited(
     """Audit these geometries; with `low`, from starts at which the battery is nearly empty."""
     layout = Layout(battery_start=(21, 30)) if low else Layout()
     env = TransformedEnv(PointNavEnv([256], layout=layout), Compose(battery, obstacle))
-    env.append_transform(ConstraintCentre(constraint_bijectors(env), ORDER))
+    env.append_transform(ConstraintAnchor(constraint_bijectors(env), ORDER))
     given = {"states": 64, "actions": 32, "steps": 12, "uniform": False} | settings
     return audit(env, order=ORDER, settings=AuditSettings(**given))
 

@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 
-from cnfp_torchrl.envs import PointNavEnv
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.evaluate import evaluate_run, table
 from cnfp_torchrl.training.evaluation import LinearScore, evaluate
 from cnfp_torchrl.training.run_folder import RunFolder

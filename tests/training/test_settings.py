@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig
 
-from cnfp_torchrl.envs import PointNavEnv
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 

@@ -9,7 +9,7 @@ import torch
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
-from cnfp_torchrl.envs import PointNavEnv
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 
@@ -24,7 +24,9 @@ def form(value: Any) -> Any:
 
 
 ENTROPIES = [
-    *itertools.product(["exact", "gauge", "radial", "squash", "none"], ["reference", "action"]),
+    *itertools.product(
+        ["exact", "gauge", "radial", "squash", "unconstrained"], ["reference", "action"]
+    ),
     ("projection", "reference"),
 ]
 
@@ -54,7 +56,7 @@ def test_violations_are_those_the_environment_counts(
         return result
 
     monkeypatch.setattr(PointNavEnv, "_step", counting_step)
-    _, summary = tiny_run("flow=none")
+    _, summary = tiny_run("flow=unconstrained")
     obstacle, battery = counted.tolist()
     assert summary["violations"] == {"obstacle": obstacle, "battery": battery}
     assert summary["violations"]["obstacle"] > 0

@@ -112,7 +112,7 @@ def evaluated(monkeypatch: pytest.MonkeyPatch) -> dict[bool, list[list[TensorDic
     return episodes
 
 
-@pytest.mark.parametrize("flow", ["exact", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "squash", "unconstrained"])
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_the_final_evaluation_follows_the_training(
     deterministic: bool,
@@ -126,7 +126,7 @@ def test_the_final_evaluation_follows_the_training(
     steps = [step for episode in evaluated[deterministic] for step in episode]
     behind = range(192, 192 + 24)
     assert len(steps) == len(behind)
-    last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "none": "1\\ bounds"}[flow]
+    last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "unconstrained": "1\\ bounds"}[flow]
     executed = read(path, f"/stages/{last}/executed", "Points2D:positions")
     assert [step for step in executed if step >= 0] == [0, 160, *behind]
     for number, step in zip(behind, steps, strict=True):
@@ -285,7 +285,7 @@ def test_replayed_episodes_are_those_of_the_evaluation(
     settings = EvaluationSettings(episodes=5, seed=7)
 
     def made() -> tuple[EnvBase, Any]:
-        env = build_environment(config, batch_size=[5], with_centre=True)
+        env = build_environment(config, batch_size=[5], with_anchor=True)
         return env, load_actor(folder, config, env)
 
     env, actor = made()

@@ -65,7 +65,7 @@ def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
     region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
     assert region.active is not None
     state = TensorDict({"observation": torch.zeros(3)}, [])
-    state["constraints", "centre"] = region.centre
+    state["constraints", "anchor"] = region.anchor
     for k, (name, each) in enumerate(sets.items(), start=1):
         state["constraints", name, "active"] = region.active[k]
         for field, value in each.fields().items():

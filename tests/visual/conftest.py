@@ -12,10 +12,10 @@ from cnfp_torchrl.visual.canvas import save_png
 
 
 def is_a_picture(path: Path) -> bool:
-    """Tell whether a file is a PNG of some size with more to it than a few flat colours."""
+    """Tell whether a file is a PNG of some size with more to it than a few flat colors."""
     with Image.open(path) as image:
-        colours = image.convert("RGB").getcolors(maxcolors=2**24)
-        return image.format == "PNG" and min(image.size) > 100 and len(colours) > 40
+        colors = image.convert("RGB").getcolors(maxcolors=2**24)
+        return image.format == "PNG" and min(image.size) > 100 and len(colors) > 40
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from cnfp_torchrl.envs import Layout
+from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.visual import banner
 from tests.visual.cases import PLANE, first, make_snapshot
 from tests.visual.conftest import is_a_picture

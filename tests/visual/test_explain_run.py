@@ -40,7 +40,7 @@ def make_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolde
     return make
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 def test_every_flow_is_explained(flow: str, make_run: Callable[..., RunFolder]) -> None:
     said = explain_run(make_run(f"flow={flow}"), step=2)
     assert said.startswith("Step 2 of 8, episode 0, seed 1000, stochastic policy\n")
@@ -55,7 +55,7 @@ def test_the_step_is_that_of_the_evaluation(
     folder = make_run("flow=exact")
     said = explain_run(folder, step=5, episode=2, seed=11, deterministic=deterministic)
     config = folder.load_config()
-    env = build_environment(config, batch_size=[3], with_centre=True)
+    env = build_environment(config, batch_size=[3], with_anchor=True)
     settings = EvaluationSettings(3, 11)
     (steps,) = replay_episodes(env, load_actor(folder, config, env), settings, [2], deterministic)
     x, y, *_ = steps[5]["observation"].tolist()

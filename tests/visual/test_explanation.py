@@ -31,7 +31,7 @@ def only(explanation: Explanation) -> ConstraintEffect:
 
 def test_a_constraint_that_binds_is_restrictive() -> None:
     # tanh(1) = 0.762 in both components; the box ends at 0.5 in the first one, which is scaled
-    # about the centre, 0 (the box is symmetric): tanh reaches 1 where the wall reaches 0.5.
+    # about the anchor, 0 (the box is symmetric): tanh reaches 1 where the wall reaches 0.5.
     walls = {"wall": Box(t([-0.5, -1.0]), t([0.5, 1.0]))}
     explanation = explain(executing(walls, [1.0, 1.0]))
     wall = only(explanation)
@@ -80,7 +80,7 @@ def test_a_constraint_that_cannot_hold_is_dropped() -> None:
     assert "far is dropped" in explanation.markdown()
 
 
-@pytest.mark.parametrize("flow", ["none", "squash"])
+@pytest.mark.parametrize("flow", ["unconstrained", "squash"])
 def test_flows_that_guarantee_nothing_are_seen_to_break(flow: str) -> None:
     snapshot = make_snapshot(PLANE, flow, samples=500)
     for index in range(50):

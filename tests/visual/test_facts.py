@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.facts import facts_of
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path as Polygon
 
 from cnfp_torchrl.geometry import ConstraintSet
-from cnfp_torchrl.visual import FlowSnapshot, constraint_colours, flow_stages
+from cnfp_torchrl.visual import FlowSnapshot, constraint_colors, flow_stages
 from tests.visual.cases import (
     CONFLICT,
     LINE,
@@ -21,7 +21,7 @@ from tests.visual.cases import (
     make_snapshot,
 )
 
-FLOWS = ["exact", "radial", "squash", "none"]
+FLOWS = ["exact", "radial", "squash", "unconstrained"]
 
 
 def stage_panels(figure: Figure, snapshot: FlowSnapshot) -> list[Axes]:
@@ -46,7 +46,7 @@ def test_a_panel_for_each_stage(count: int, flow: str, draws: Callable[[Figure],
         "exact": ["action bounds", *first(PLANE, count)],
         "radial": ["action bounds", *first(PLANE, count)],
         "squash": list(first(PLANE, count)) or ["action bounds"],
-        "none": ["action bounds"],
+        "unconstrained": ["action bounds"],
     }[flow]
     assert titles == [f"stage {i}: {name}" for i, name in enumerate(names, start=1)]
     assert draws(figure)
@@ -65,7 +65,7 @@ def test_all_samples_lie_inside_the_drawn_set(sets: dict[str, ConstraintSet], fl
         assert "0 of 1000" in axes.get_title()
 
 
-@pytest.mark.parametrize("flow", ["squash", "none"])
+@pytest.mark.parametrize("flow", ["squash", "unconstrained"])
 def test_samples_outside_are_marked_and_counted(flow: str) -> None:
     snapshot = make_snapshot(PLANE, flow, samples=1000)
     last = stage_panels(flow_stages(snapshot), snapshot)[-1]
@@ -77,16 +77,16 @@ def test_samples_outside_are_marked_and_counted(flow: str) -> None:
     assert snapshot.region.contains(torch.tensor(drawn(last, "samples"))).all()
 
 
-def test_constraints_keep_their_colours_in_every_panel() -> None:
+def test_constraints_keep_their_colors_in_every_panel() -> None:
     sets = {**PLANE, **PLANE_OF_OTHERS}
-    colours = constraint_colours(sets)
+    colors = constraint_colors(sets)
     for names in (["battery", "visible"], ["power", "obstacle"]):
         snapshot = make_snapshot({name: sets[name] for name in names})
-        figure = flow_stages(snapshot, colours=colours)
+        figure = flow_stages(snapshot, colors=colors)
         for axes in stage_panels(figure, snapshot):
             for name in names:
                 shown = {ln.get_color() for ln in axes.lines if ln.get_label() == name}
-                assert shown == {colours[name]}
+                assert shown == {colors[name]}
         legend = {text.get_text() for text in figure.legends[0].get_texts()}
         assert {f"{name} set" for name in names} < legend
 
@@ -123,7 +123,7 @@ def test_one_action_component(flow: str, draws: Callable[[Figure], bool]) -> Non
     assert draws(figure)
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "unconstrained"])
 def test_three_action_components(flow: str, draws: Callable[[Figure], bool]) -> None:
     snapshot = make_snapshot(SPACE, flow, dim=3)
     figure = flow_stages(snapshot)

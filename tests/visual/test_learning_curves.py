@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from torchrl.record.loggers import CSVLogger
 
-from cnfp_torchrl.visual import constraint_colours, learning_curves, read_scalars
+from cnfp_torchrl.visual import constraint_colors, learning_curves, read_scalars
 
 STEPS = [500, 1000, 1500]
 LOGGED = {
@@ -74,12 +74,12 @@ def test_every_curve_is_drawn_as_logged(metrics: Path, draws: Callable[[Figure],
     assert draws(figure)
 
 
-def test_violations_have_their_constraints_colour_and_total(metrics: Path) -> None:
+def test_violations_have_their_constraints_color_and_total(metrics: Path) -> None:
     axes = learning_curves(read_scalars(metrics)).axes[1]
-    colours = constraint_colours(["battery", "obstacle"])
+    colors = constraint_colors(["battery", "obstacle"])
     assert {line.get_label(): line.get_color() for line in axes.lines} == {
-        "battery: 1,040": colours["battery"],
-        "obstacle: 592": colours["obstacle"],
+        "battery: 1,040": colors["battery"],
+        "obstacle: 592": colors["obstacle"],
     }
 
 

@@ -39,17 +39,17 @@ def test_set_beyond_the_view_has_no_outline() -> None:
 def test_region_outline_is_on_the_edge_of_the_region(sets: dict[str, ConstraintSet]) -> None:
     region = Region.build([BOUNDS, *sets.values()])
     line = torch.tensor(region_outline(region, range(len(region.sets))))
-    inwards = region.centre + (line - region.centre) * (1 - 1e-4)
+    inwards = region.anchor + (line - region.anchor) * (1 - 1e-4)
     assert region.contains(inwards).all()
     if not any(isinstance(each, VisibleRegion) for each in sets.values()):
-        # A visible region is seen from the centre: its outline may stop short of the true set.
-        assert not region.contains(region.centre + (line - region.centre) * (1 + 1e-4)).any()
+        # A visible region is seen from the anchor: its outline may stop short of the true set.
+        assert not region.contains(region.anchor + (line - region.anchor) * (1 + 1e-4)).any()
 
 
 def test_region_outline_grows_no_larger_with_each_set() -> None:
     region = Region.build([BOUNDS, *PLANE.values()])
     reach = [
-        np.linalg.norm(region_outline(region, range(k + 1)) - region.centre.numpy(), axis=-1)
+        np.linalg.norm(region_outline(region, range(k + 1)) - region.anchor.numpy(), axis=-1)
         for k in range(len(region.sets))
     ]
     for outer, inner in itertools.pairwise(reach):
@@ -60,7 +60,7 @@ def test_region_outline_grows_no_larger_with_each_set() -> None:
 def test_shadow_of_a_ball_is_a_disc() -> None:
     ball = Ball(torch.tensor([0.1, -0.2, 0.3]), torch.tensor(0.5))
     region = Region(
-        (Box(-torch.ones(3), torch.ones(3)), ball), centre=torch.tensor([0.3, 0.0, 0.0])
+        (Box(-torch.ones(3), torch.ones(3)), ball), anchor=torch.tensor([0.3, 0.0, 0.0])
     )
     line = region_outline(region, (0, 1))
     distance = np.hypot(line[:, 0] - 0.1, line[:, 1] + 0.2)

@@ -42,7 +42,7 @@ def in_float64(step: TensorDictBase) -> TensorDictBase:
     return step.apply(lambda value: value.double() if value.is_floating_point() else value)
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("length", [0.0, 0.3, 2.0])
 def test_path_is_the_one_that_was_taken(case: str, flow: str, length: float) -> None:
@@ -62,7 +62,7 @@ def test_path_is_the_one_that_was_taken(case: str, flow: str, length: float) -> 
     assert torch.equal(snapshot.path()[-1], step["action"])
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "unconstrained"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_saturated_actions_have_a_path_too(flow: str, sign: float) -> None:
     latent = sign * torch.tensor([30.0, -9.0])
@@ -105,11 +105,11 @@ def test_action_of_another_policy_stands_still() -> None:
     assert torch.equal(snapshot.path(), step["action"].expand(4, 2))
 
 
-def test_centre_is_found_where_the_flow_needs_none() -> None:
+def test_anchor_is_found_where_the_flow_needs_none() -> None:
     actor, step, _ = taken(PLANE, 2, "squash", torch.tensor([0.4, -0.9]))
-    del step["constraints", "centre"]
+    del step["constraints", "anchor"]
     snapshot = replay_step(actor, step, NOISE[:, :2])
-    assert snapshot.region.contains(snapshot.region.centre)
+    assert snapshot.region.contains(snapshot.region.anchor)
     assert snapshot.region.active is not None
     assert snapshot.region.active.all()
 

@@ -42,7 +42,7 @@ def make_run(tmp_path: Path) -> RunFactory:
     def make(config: DictConfig) -> RunFolder:
         folder = RunFolder.create(tmp_path / "run")
         folder.save_config(config)
-        actor = build_actor(config, build_environment(config, with_centre=True))
+        actor = build_actor(config, build_environment(config, with_anchor=True))
         folder.save_checkpoint(actor=actor)
         return folder
 
@@ -76,7 +76,7 @@ def check(folder: RunFolder, expected: set[str]) -> None:
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 def test_every_flow(flow: str, make_run: RunFactory) -> None:
     check(make_run(configure(f"flow={flow}")), ALL)
 
@@ -92,8 +92,8 @@ def test_environment_without_map_and_constraints(make_run: RunFactory) -> None:
 def test_untrusted_targets_are_refused(make_run: RunFactory) -> None:
     folder = make_run(configure())
     text = (folder.path / "config.yaml").read_text()
-    assert "cnfp_torchrl.envs.PointNavEnv" in text
-    changed = text.replace("cnfp_torchrl.envs.PointNavEnv", "somewhere.envs.PointNavEnv")
+    assert "cnfp_torchrl.tasks.point_nav.PointNavEnv" in text
+    changed = text.replace("cnfp_torchrl.tasks.point_nav.PointNavEnv", "somewhere.envs.PointNavEnv")
     (folder.path / "config.yaml").write_text(changed)
     with pytest.raises(PermissionError, match=r"somewhere\.envs\.PointNavEnv"):
         draw_run_figures(folder)

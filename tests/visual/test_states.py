@@ -5,16 +5,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import (
-    BatteryGeometry,
-    GeometryTransform,
-    Layout,
-    ObstacleGeometry,
-    PointNavEnv,
-    constraint_bijectors,
-)
+from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, Box, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import telling_states
 from cnfp_torchrl.visual.arena import layout_of
@@ -41,7 +35,7 @@ def point_nav(layout: Layout) -> TransformedEnv:
         "obstacle": ObstacleGeometry(layout, "obstacle"),
     }
     base = PointNavEnv([64], layout=layout, seed=0)
-    return make_environment(base, geometry, order=ORDER, with_centre=True)
+    return make_environment(base, geometry, order=ORDER, with_anchor=True)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -95,7 +89,7 @@ class SwingGently(GeometryTransform):
 
 def test_environment_without_a_map() -> None:
     env = make_environment(
-        GymEnv("Pendulum-v1"), {"gentle": SwingGently("gentle")}, order=["gentle"], with_centre=True
+        GymEnv("Pendulum-v1"), {"gentle": SwingGently("gentle")}, order=["gentle"], with_anchor=True
     )
     env.set_seed(0)
     assert layout_of(env) is None
@@ -108,15 +102,15 @@ def test_openness_of_known_regions() -> None:
     bounds = Box(-torch.ones(2), torch.ones(2))
     half = Ball(torch.zeros(2), torch.tensor(0.5))
     huge = Ball(torch.zeros(2), torch.tensor(9.0))
-    centre = torch.zeros(1, 2)
-    share, edge = openness(Region((bounds, huge, half), centre))
+    anchor = torch.zeros(1, 2)
+    share, edge = openness(Region((bounds, huge, half), anchor))
     assert edge.tolist() == [[0.0, 1.0]]
     angles = torch.linspace(0, 2 * torch.pi, 10_001)[:-1]
     mean = (0.5 * torch.maximum(angles.cos().abs(), angles.sin().abs())).mean()
     assert share == pytest.approx(float(mean), abs=0.01)
 
     dropped = torch.tensor([[True, True, False]])
-    share, edge = openness(Region((bounds, huge, half), centre, dropped))
+    share, edge = openness(Region((bounds, huge, half), anchor, dropped))
     assert share == 1
     assert edge.tolist() == [[0.0, 0.0]]
 

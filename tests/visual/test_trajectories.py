@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tensordict.nn import TensorDictModule
 
-from cnfp_torchrl.envs import Layout, PointNavEnv
-from cnfp_torchrl.visual import Episode, constraint_colours, record_episodes, trajectories
+from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv
+from cnfp_torchrl.visual import Episode, constraint_colors, record_episodes, trajectories
 
 LAYOUTS = {
     "reference": Layout(),
@@ -54,10 +54,10 @@ def test_line_follows_the_agent_and_shows_the_battery() -> None:
 
 def test_violations_are_marked_where_the_step_ended() -> None:
     figure = trajectories(Layout(), [episode()], NAMES)
-    axes, colours = figure.axes[0], constraint_colours(NAMES)
+    axes, colors = figure.axes[0], constraint_colors(NAMES)
     at = {line.get_color(): line.get_xydata() for line in axes.lines if line.get_marker() in "x+"}
-    np.testing.assert_allclose(at[colours["obstacle"]], [[0.0, 0.5], [0.5, 0.5]])
-    np.testing.assert_allclose(at[colours["battery"]], [[0.5, 0.5]])
+    np.testing.assert_allclose(at[colors["obstacle"]], [[0.0, 0.5], [0.5, 0.5]])
+    np.testing.assert_allclose(at[colors["battery"]], [[0.5, 0.5]])
     assert axes.get_title() == "return 6.5 · 1 goal · 3 violations"
     legend = {text.get_text() for text in figure.legends[0].get_texts()}
     assert {"breaks obstacle", "breaks battery"} < legend

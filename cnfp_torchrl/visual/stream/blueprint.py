@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs.layout import BATTERY_FULL
+from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL
 from cnfp_torchrl.visual.stream import style
 from cnfp_torchrl.visual.stream.legend import legend_size
 from cnfp_torchrl.visual.stream.scene import (

@@ -32,14 +32,14 @@ class ActionGrid:
     def __init__(self, limits: Sequence[tuple[float, float]], cells: int) -> None:
         share = (torch.arange(cells) + 0.5) / cells
         axes = [low + (high - low) * share for low, high in limits]
-        # One component after the other in memory: to add up two neighbours takes thrice as long.
+        # One component after the other in memory: to add up two neighbors takes thrice as long.
         self.actions = torch.stack(torch.meshgrid(*axes, indexing="xy")).movedim(0, -1)
         """``(cells, d)`` or, the second component first, ``(cells, cells, d)``."""
 
     def log_densities(self, snapshot: FlowSnapshot) -> Tensor:
         """Return the log-density after each stage, ``(stages, *cells)``; -inf outside.
 
-        In the precision of the snapshot, which is much finer than colours are.
+        In the precision of the snapshot, which is much finer than colors are.
 
         Args:
             snapshot: the policy in a state.

@@ -1,10 +1,10 @@
-"""The legend of the stage views and the map, in their own colours."""
+"""The legend of the stage views and the map, in their own colors."""
 
 from __future__ import annotations
 
 import rerun as rr
 
-from cnfp_torchrl.visual.colours import rgb
+from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.stream import style
 from cnfp_torchrl.visual.stream.entities import Entities
 from cnfp_torchrl.visual.stream.scene import LEGEND, FlowScene
@@ -36,8 +36,8 @@ def log_legend(stream: rr.RecordingStream, scene: FlowScene) -> None:
     Entities(stream, LEGEND).style("", points)
 
 
-def _entries(scene: FlowScene) -> dict[str, style.Colour]:
-    entries = {f"{name} set": rgb(colour) for name, colour in scene.colours.items()}
+def _entries(scene: FlowScene) -> dict[str, style.Color]:
+    entries = {f"{name} set": rgb(color) for name, color in scene.colors.items()}
     return {
         "executed action, its path": style.EXECUTED,
         "samples of the policy": style.SAMPLE,
@@ -45,5 +45,5 @@ def _entries(scene: FlowScene) -> dict[str, style.Colour]:
         **entries,
         "density": style.GLOW,
         "samples outside": style.BREAKS,
-        **({"goal": style.GOAL_COLOUR, "station": style.STATION_COLOUR} if scene.layout else {}),
+        **({"goal": style.GOAL_COLOR, "station": style.STATION_COLOR} if scene.layout else {}),
     }

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 import torch
 
-from cnfp_torchrl.visual.colours import rgb
+from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 from cnfp_torchrl.visual.stream import style
@@ -87,8 +87,8 @@ class LineView:
         curve = lines(colors=style.CURVE, radii=style.LINE, draw_order=5)
         self._entities.style("density", curve)
         for k, name in enumerate(scene.constraints, start=1):
-            colour = rgb(scene.colours[name])
-            self._entities.style(f"sets/{k}", lines(colors=colour, radii=style.BAR, draw_order=20))
+            color = rgb(scene.colors[name])
+            self._entities.style(f"sets/{k}", lines(colors=color, radii=style.BAR, draw_order=20))
 
 
 def _post(x: float) -> Line:

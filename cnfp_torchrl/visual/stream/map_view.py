@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs import Layout
-from cnfp_torchrl.visual.colours import rgb
+from cnfp_torchrl.tasks.point_nav import Layout
+from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line, set_outline
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 from cnfp_torchrl.visual.stream import style
@@ -28,7 +28,7 @@ class MapView:
 
     Args:
         stream: where to log.
-        scene: with the constraints' colours.
+        scene: with the constraints' colors.
         layout: the map.
     """
 
@@ -86,7 +86,7 @@ class MapView:
         self._entities.style(
             "walls", rr.LineStrips2D([corners], colors=style.MUTED, radii=style.LINE, draw_order=9)
         )
-        # Boxes have no filling: an image of one colour, stretched, has.
+        # Boxes have no filling: an image of one color, stretched, has.
         pixels = np.full((2, 2, 3), style.OBSTACLE, dtype=np.uint8)
         for i, (x_low, y_low, x_high, y_high) in enumerate(layout.rectangles):
             size = [(x_high - x_low) / 2, (y_high - y_low) / 2, 1]
@@ -108,7 +108,7 @@ class MapView:
         self._entities.style(
             "stations/places",
             rr.Points2D(
-                layout.stations, radii=style.KNOT, colors=style.STATION_COLOUR, draw_order=3
+                layout.stations, radii=style.KNOT, colors=style.STATION_COLOR, draw_order=3
             ),
         )
 
@@ -121,7 +121,7 @@ class MapView:
             "targets": points(colors=style.SAMPLE, radii=style.THIN, draw_order=11),
             "allowed_moves": lines(colors=style.PALE, radii=style.LINE, draw_order=22),
             "goal": points(
-                colors=[style.GOAL_ZONE, style.GOAL_COLOUR],
+                colors=[style.GOAL_ZONE, style.GOAL_COLOR],
                 radii=[goal, style.MARK_INSIDE],
                 draw_order=4,
             ),
@@ -134,9 +134,9 @@ class MapView:
         }.items():
             self._entities.style(name, archetype)
         for k, name in enumerate(scene.constraints, start=1):
-            colour = rgb(scene.colours[name])
-            self._entities.style(f"sets/{k}", lines(colors=colour, radii=style.LINE, draw_order=20))
+            color = rgb(scene.colors[name])
+            self._entities.style(f"sets/{k}", lines(colors=color, radii=style.LINE, draw_order=20))
             self._entities.style(
                 f"sets_dropped/{k}",
-                lines(colors=style.dimmed(colour), radii=style.THIN, draw_order=19),
+                lines(colors=style.dimmed(color), radii=style.THIN, draw_order=19),
             )

@@ -18,10 +18,10 @@ _STRAIGHT, _SAME = 1e-9, 1e-6
 
 
 class RayOutlines:
-    """Boundaries of sets in the plane of two action components, seen from the region's centre.
+    """Boundaries of sets in the plane of two action components, seen from the region's anchor.
 
     Along each ray the boundary lies at one over the gauge. In two dimensions that is all there is
-    of a set; in more it is the section through the centre, and in one it is the interval's ends.
+    of a set; in more it is the section through the anchor, and in one it is the interval's ends.
 
     Args:
         region: of one state.
@@ -30,12 +30,12 @@ class RayOutlines:
 
     def __init__(self, region: Region, components: Sequence[int]) -> None:
         chosen = list(components)
-        self._centre = region.centre[chosen].numpy()
-        self._ray = _rays(self._centre, _corners(region, chosen))
-        direction = region.centre.new_zeros(region.centre.shape[-1], len(self._ray)).T
+        self._anchor = region.anchor[chosen].numpy()
+        self._ray = _rays(self._anchor, _corners(region, chosen))
+        direction = region.anchor.new_zeros(region.anchor.shape[-1], len(self._ray)).T
         direction[:, chosen] = torch.from_numpy(self._ray)
         self._gauges = [
-            each.gauge(direction, region.centre).numpy()
+            each.gauge(direction, region.anchor).numpy()
             if region.active is None or bool(region.active[k])
             else None
             for k, each in enumerate(region.sets)
@@ -52,7 +52,7 @@ class RayOutlines:
         if key not in self._boundaries:
             gauges = [gauge for k in key if (gauge := self._gauges[k]) is not None]
             largest = np.maximum.reduce([np.full(len(self._ray), 1 / _FAR), *gauges])
-            self._boundaries[key] = self._centre + self._ray / largest[:, None]
+            self._boundaries[key] = self._anchor + self._ray / largest[:, None]
         return self._boundaries[key]
 
 
@@ -105,11 +105,11 @@ def _simplified(line: Line) -> Line:
     return line[keep]
 
 
-def _rays(centre: Line, corners: Line) -> Line:
+def _rays(anchor: Line, corners: Line) -> Line:
     """Return directions all around, the first one again at the end, and those of the corners."""
-    if len(centre) == 1:
+    if len(anchor) == 1:
         return np.array([[-1.0], [1.0]])
-    x, y = (corners - centre).T
+    x, y = (corners - anchor).T
     angle = np.sort(np.concatenate([_ANGLES, np.arctan2(y, x)]))
     # Two equal rays would hide the corner between them from `_simplified`.
     angle = angle[np.diff(angle, prepend=-np.inf) > _SAME]

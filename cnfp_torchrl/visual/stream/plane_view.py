@@ -7,7 +7,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.components import ImageFormat
 
-from cnfp_torchrl.visual.colours import rgb
+from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import set_outline
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 from cnfp_torchrl.visual.stream import components, style
@@ -40,9 +40,9 @@ class PlaneView:
         self._limits = (*first, *second)
         name = scene.stages[view.stage]
         self._is_last = view.stage + 1 == len(scene.stages)
-        colour = rgb(scene.colours[name]) if name in scene.colours else style.MUTED
+        color = rgb(scene.colors[name]) if name in scene.colors else style.MUTED
         self._log_frame(scene)
-        self._log_styles(scene, colour)
+        self._log_styles(scene, color)
         if not self._is_section:
             self._log_density_style(scene, cells)
 
@@ -57,7 +57,7 @@ class PlaneView:
         entities = self._entities
         samples = self._shown(snapshot, self.stage)[1:]
         # Exact flows stay inside after every stage; what is executed is looked at all the same.
-        looked_at = self._is_last or not snapshot.is_exact
+        looked_at = self._is_last or not snapshot.is_safe
         outside = snapshot.outside(self.stage)[1:].numpy() if looked_at else np.zeros(0, dtype=bool)
         if heat is not None:
             entities.log("density", components.pixels(heat))
@@ -126,17 +126,17 @@ class PlaneView:
         place = rr.Transform3D(translation=[x_low, y_low, 0], scale=cell)
         self._entities.style("density", place, image)
 
-    def _log_styles(self, scene: FlowScene, colour: style.Colour) -> None:
+    def _log_styles(self, scene: FlowScene, color: style.Color) -> None:
         for name, archetypes in style.stage_styles(self.stage).items():
             self._entities.style(name, *archetypes)
         lines = rr.LineStrips2D.from_fields
         for k, name in enumerate(scene.constraints, start=1):
             if self._is_last and name not in scene.stages:
-                own = lines(colors=rgb(scene.colours[name]), radii=style.LINE, draw_order=18)
+                own = lines(colors=rgb(scene.colors[name]), radii=style.LINE, draw_order=18)
                 self._entities.style(f"sets_not_applied/{k}", own)
         for name, archetype in {
             "way_from_stage_before": lines(colors=style.WAY, radii=style.THIN, draw_order=5),
-            "own_set_dropped": lines(colors=style.dimmed(colour), radii=style.LINE, draw_order=19),
-            "own_set": lines(colors=colour, radii=style.WIDE, draw_order=20),
+            "own_set_dropped": lines(colors=style.dimmed(color), radii=style.LINE, draw_order=19),
+            "own_set": lines(colors=color, radii=style.WIDE, draw_order=20),
         }.items():
             self._entities.style(name, archetype)

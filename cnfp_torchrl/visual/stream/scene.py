@@ -1,4 +1,4 @@
-"""What the stream and its blueprint share: names, entity paths, limits and colours."""
+"""What the stream and its blueprint share: names, entity paths, limits and colors."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import rerun as rr
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import Layout, constraint_names
+from cnfp_torchrl.envs import constraint_names
 from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.visual.arena import layout_of
-from cnfp_torchrl.visual.colours import constraint_colours
+from cnfp_torchrl.visual.colors import constraint_colors
 
 TIMELINE = "env_step"
 MAP = "map"
@@ -97,7 +98,7 @@ class FlowScene:
                 f"{type(head.flow).__name__}, whose stages have none to draw"
             )
         dim = int(head.low.shape[-1])
-        moves = head.flow.reads_constraints and not head.flow.is_exact
+        moves = head.flow.reads_constraints and not head.flow.is_safe
         return cls(
             stages=tuple(head.stage_names),
             constraints=tuple(head.order),
@@ -116,9 +117,9 @@ class FlowScene:
         return len(self.low)
 
     @property
-    def colours(self) -> dict[str, str]:
-        """The constraints' colours, those of all figures."""
-        return constraint_colours(self.constraints)
+    def colors(self) -> dict[str, str]:
+        """The constraints' colors, those of all figures."""
+        return constraint_colors(self.constraints)
 
     @property
     def limits(self) -> tuple[tuple[float, float], ...]:

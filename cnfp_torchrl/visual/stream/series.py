@@ -5,8 +5,8 @@ from __future__ import annotations
 import rerun as rr
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs.layout import BATTERY_FULL
-from cnfp_torchrl.visual.colours import rgb
+from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL
+from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 from cnfp_torchrl.visual.stream import components, style
 from cnfp_torchrl.visual.stream.scene import METRICS, SERIES, FlowScene
@@ -16,8 +16,8 @@ class Series:
     """Sum up an episode and log it.
 
     Args:
-        stream: where to log; names and colours are logged at once.
-        scene: with the costs' names and the constraints' colours.
+        stream: where to log; names and colors are logged at once.
+        scene: with the costs' names and the constraints' colors.
     """
 
     def __init__(self, stream: rr.RecordingStream, scene: FlowScene) -> None:
@@ -70,20 +70,20 @@ class Series:
             "entropy": ([style.SAMPLE], ["entropy (nats)"]),
         }
         if self._costs:
-            colours = [rgb(scene.colours.get(name, "#8A8A8A")) for name in scene.costs]
-            styles["costs"] = (colours, list(scene.costs))
+            colors = [rgb(scene.colors.get(name, "#8A8A8A")) for name in scene.costs]
+            styles["costs"] = (colors, list(scene.costs))
         if scene.layout is not None:
-            battery = rgb(scene.colours.get("battery", "#8A8A8A"))
+            battery = rgb(scene.colors.get("battery", "#8A8A8A"))
             styles["battery"] = ([battery, style.MUTED], ["battery", "threshold"])
-        for name, (colours, names) in styles.items():
+        for name, (colors, names) in styles.items():
             self._stream.log(
                 f"{SERIES}/{name}",
-                rr.SeriesLines(colors=colours, names=names, widths=[2.0] * len(names)),
+                rr.SeriesLines(colors=colors, names=names, widths=[2.0] * len(names)),
                 static=True,
             )
-        for name, colour in scene.colours.items():
+        for name, color in scene.colors.items():
             for metric in (f"violations/{name}", f"train/lambda_{name}"):
-                line = rr.SeriesLines(colors=rgb(colour), names=name)
+                line = rr.SeriesLines(colors=rgb(color), names=name)
                 self._stream.log(
                     rr.new_entity_path([METRICS, *metric.split("/")]), line, static=True
                 )

@@ -1,4 +1,4 @@
-"""Colours and sizes on a dark background; constraints keep the colours of all figures.
+"""Colors and sizes on a dark background; constraints keep the colors of all figures.
 
 Of entities that more than one view has, also in which order they are drawn.
 """
@@ -10,31 +10,31 @@ from typing import Literal
 
 import rerun as rr
 
-from cnfp_torchrl.visual.colours import GOAL, STATION, rgb
+from cnfp_torchrl.visual.colors import GOAL, STATION, rgb
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
-BACKGROUND: Colour = (0, 0, 4)
-PALE: Colour = (235, 235, 240)
-MUTED: Colour = (120, 122, 135)
-FAINT: Colour = (62, 64, 76)
-WAY: Colour = (84, 70, 120)
-SAMPLE: Colour = (190, 196, 214)
-BREAKS: Colour = (255, 226, 30)
-EXECUTED: Colour = (80, 255, 190)
-OBSTACLE: Colour = (84, 86, 98)
-TRAIL: Colour = (150, 154, 170)
-REWARD: Colour = (240, 190, 80)
-GLOW: Colour = (160, 47, 127)
-CURVE: Colour = (160, 120, 230)
-ZONE: Colour = (14, 62, 52)
-GOAL_ZONE: Colour = (78, 56, 12)
-GOAL_COLOUR: Colour = rgb(GOAL)
-STATION_COLOUR: Colour = rgb(STATION)
+BACKGROUND: Color = (0, 0, 4)
+PALE: Color = (235, 235, 240)
+MUTED: Color = (120, 122, 135)
+FAINT: Color = (62, 64, 76)
+WAY: Color = (84, 70, 120)
+SAMPLE: Color = (190, 196, 214)
+BREAKS: Color = (255, 226, 30)
+EXECUTED: Color = (80, 255, 190)
+OBSTACLE: Color = (84, 86, 98)
+TRAIL: Color = (150, 154, 170)
+REWARD: Color = (240, 190, 80)
+GLOW: Color = (160, 47, 127)
+CURVE: Color = (160, 120, 230)
+ZONE: Color = (14, 62, 52)
+GOAL_ZONE: Color = (78, 56, 12)
+GOAL_COLOR: Color = rgb(GOAL)
+STATION_COLOR: Color = rgb(STATION)
 
 HEAT: Literal["magma"] = "magma"
 HEAT_TOP = 420
-"""Bytes up to 255 are drawn with the lower part of the colours, which lines stand out from."""
+"""Bytes up to 255 are drawn with the lower part of the colors, which lines stand out from."""
 
 # Radii on the screen, which Rerun tells from those in the scene by their sign.
 THIN = -0.8
@@ -48,9 +48,9 @@ MARK = -5.5
 MARK_INSIDE = -3.5
 
 
-def dimmed(colour: Colour) -> Colour:
-    """Return a colour half way to the background, for what does not hold."""
-    red, green, blue = ((c + b) // 2 for c, b in zip(colour, BACKGROUND, strict=True))
+def dimmed(color: Color) -> Color:
+    """Return a color half way to the background, for what does not hold."""
+    red, green, blue = ((c + b) // 2 for c, b in zip(color, BACKGROUND, strict=True))
     return red, green, blue
 
 

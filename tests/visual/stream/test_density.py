@@ -14,7 +14,7 @@ from tests.visual.cases import CONFLICT, LINE, PLANE, make_actor, make_state
 CASES = {"three": (PLANE, 2), "one is dropped": (CONFLICT, 2), "on a line": (LINE, 1)}
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 @pytest.mark.parametrize("case", CASES)
 def test_last_stage_is_the_policys_log_density(case: str, flow: str) -> None:
     sets, dim = CASES[case]

@@ -10,8 +10,9 @@ import rerun as rr
 import torch
 from tensordict import TensorDict
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
@@ -41,7 +42,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "none"])
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 @pytest.mark.parametrize("case", CASES)
 def test_any_flow_in_any_action_space(case: str, flow: str, tmp_path: Path) -> None:
     sets, dim = CASES[case]
@@ -49,7 +50,9 @@ def test_any_flow_in_any_action_space(case: str, flow: str, tmp_path: Path) -> N
         pytest.skip("some of these sets have no squash")
     path = tmp_path / "recording.rrd"
     first_step, second_step = record_steps(path, sets, flow, dim=dim)
-    stages = {"squash": list(sets) or ["bounds"], "none": ["bounds"]}.get(flow, ["bounds", *sets])
+    stages = {"squash": list(sets) or ["bounds"], "unconstrained": ["bounds"]}.get(
+        flow, ["bounds", *sets]
+    )
     for number, name in enumerate(stages, start=1):
         view = f"/stages/{number}\\ {name}" + ("/a1\\,\\ a2" if dim > 2 else "")
         samples = read(path, f"{view}/samples", "Points2D:positions")
@@ -101,7 +104,7 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
         PointNavEnv([2], seed=0, max_steps=3),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=["battery", "obstacle"],
-        with_centre=True,
+        with_anchor=True,
     )
     actor = make_constrained_actor(
         Gaussian(torch.zeros(2), torch.ones(2)),
@@ -137,12 +140,12 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
     (vector,) = read(path, "/map/move", "Arrows2D:vectors")[30]
     np.testing.assert_allclose(vector, 0.1 * rollout["action"][3].double().numpy(), rtol=1e-6)
     # The battery's ball, in arena units around the nearest station.
-    centre = place[2] + 0.1 * rollout["constraints", "battery", "center"][2].double().numpy()
+    anchor = place[2] + 0.1 * rollout["constraints", "battery", "center"][2].double().numpy()
     radius = 0.1 * float(rollout["constraints", "battery", "radius"][2])
     strips = read(path, "/map/sets/1", "LineStrips2D:strips")
     for line in strips[max(step for step in strips if step <= 20)]:
         inner = np.array([point for point in line if max(map(abs, point)) < 0.9999])
-        np.testing.assert_allclose(np.linalg.norm(inner - centre, axis=-1), radius, rtol=1e-4)
+        np.testing.assert_allclose(np.linalg.norm(inner - anchor, axis=-1), radius, rtol=1e-4)
     trail = read(path, "/map/trail", "LineStrips2D:strips")
     assert len(trail[20][-1]) == 3
     assert len(trail[40][-1]) == 2  # the episode ended after the third step

@@ -63,7 +63,7 @@ def test_intervals_end_where_they_end() -> None:
 def test_sections_lie_in_the_set() -> None:
     region = region_of(SPACE, 3)
     boundary = RayOutlines(region, (2, 0)).of_set(1)
-    points = region.centre.expand(len(boundary), 3).clone()
+    points = region.anchor.expand(len(boundary), 3).clone()
     points[:, [2, 0]] = torch.from_numpy(boundary)
     assert region.sets[1].slack(points).abs().max() < 1e-9
 

@@ -10,8 +10,9 @@ import rerun as rr
 import torch
 from rerun.experimental import ViewerClient
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.stream import TRAINING_PLOTS, FlowStream, RerunLogger, flow_blueprint
 from tests.visual.cases import LINE, SPACE, Gaussian
@@ -78,7 +79,7 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
         PointNavEnv([1], seed=0),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=["battery", "obstacle"],
-        with_centre=True,
+        with_anchor=True,
     )
     actor = make_constrained_actor(
         Gaussian(torch.zeros(2), torch.ones(2)),

@@ -12,8 +12,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import BatteryGeometry, ObstacleGeometry, PointNavEnv, constraint_bijectors
+from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.stream import FlowStream, StreamHook, StreamTransform
 from tests.visual.cases import Gaussian, make_actor
@@ -25,7 +26,7 @@ def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorD
         PointNavEnv(batch, seed=0, max_steps=4),
         {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
         order=["battery", "obstacle"],
-        with_centre=True,
+        with_anchor=True,
     )
     actor = make_constrained_actor(
         Gaussian(torch.zeros(2), torch.ones(2)),

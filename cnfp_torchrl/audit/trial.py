@@ -1,0 +1,150 @@
+"""The actions that an audit tries in each state, what they led to, and how that is written down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from cnfp_torchrl.audit.probes import Probe
+from cnfp_torchrl.audit.report import plain
+from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.modules import ConstrainedFlowModule
+
+HUGE = 1e6
+"""Latents of this scale saturate every squash."""
+
+LATENTS = ("latents N(0, 1)", "latents N(0, 10²)", "one latent huge", "all latents huge")
+"""One huge latent among moderate ones reaches every point of the boundary, all of them corners."""
+
+UNIFORM = "uniform in the action bounds"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """All actions tried in n states, m from the flow and then m uniform ones, and judgments.
+
+    Args:
+        head: the flow.
+        states: ``(n,)``.
+        keys: the entries of a state that say which one it is.
+        region: the sets, anchors and flags of the states.
+        actions: ``(2 m, n, d)``.
+        reachable: whether the flow can reach each action, ``(2 m, n)``.
+        violated: by constraint; False where no indicator judges, ``(2 m, n, K)``.
+        kept: whether each constraint is active in the next state, ``(2 m, n, K)``.
+        judged: whether a constraint has an indicator, K of them.
+    """
+
+    head: ConstrainedFlowModule
+    states: TensorDictBase
+    keys: Sequence[NestedKey]
+    region: Region
+    actions: Tensor
+    reachable: Tensor
+    violated: Tensor
+    kept: Tensor
+    judged: tuple[bool, ...]
+
+    @property
+    def half(self) -> int:
+        """The number m of actions of each kind."""
+        return len(self.actions) // 2
+
+    @property
+    def active(self) -> Tensor:
+        """Which constraints are active in which state, ``(n, K)``."""
+        assert self.region.active is not None
+        return self.region.active[..., 1:]
+
+    def tried(self, row: int, state: int) -> dict[str, Any]:
+        """Return one action in its state as plain values."""
+        latents = LATENTS[row % len(LATENTS)]
+        flags = self.violated[row, state].tolist()
+        return {
+            **self.described(state),
+            "action": plain(self.actions[row, state]),
+            "drawn": latents if row < self.half else UNIFORM,
+            "violates": [name for name, bad in zip(self.head.order, flags, strict=True) if bad],
+        }
+
+    def described(self, state: int) -> dict[str, Any]:
+        """Return a state as plain values: its entries, and each constraint's set."""
+        return describe(self.head, self.states[state], self.keys)
+
+
+def run_trial(
+    probe: Probe,
+    head: ConstrainedFlowModule,
+    keys: Sequence[NestedKey],
+    indicators: Sequence[str],
+    actions: int,
+) -> Trial:
+    """Draw actions in every state, through the flow and uniformly, and have them judged.
+
+    Args:
+        probe: the states.
+        head: the flow.
+        keys: the entries of a state that say which one it is.
+        indicators: the names of what the probe judges by.
+        actions: number of each kind in each state.
+    """
+    states, bounds = probe.states, head.bounds
+    bijector = head.get_bijector(states)
+    latents = draw_latents(actions, len(states), bounds.dim).to(bounds.low)
+    sampled, _ = bijector.forward_and_log_det(latents)
+    uniform = bounds.low + (bounds.high - bounds.low) * torch.rand_like(latents)
+    tried = torch.cat([sampled, uniform])
+    outcome = probe.outcome(tried)
+    unjudged = torch.zeros_like(outcome.violated[..., 0])
+    columns = dict(zip(indicators, outcome.violated.unbind(-1), strict=True))
+    return Trial(
+        head,
+        states,
+        keys,
+        head.get_region(states),
+        tried,
+        bijector.contains(tried),
+        torch.stack([columns.get(name, unjudged) for name in head.order], dim=-1),
+        outcome.kept,
+        tuple(name in indicators for name in head.order),
+    )
+
+
+def draw_latents(rows: int, states: int, dim: int) -> Tensor:
+    """Return latents ``(rows, states, dim)``, row i of the kind ``LATENTS[i % 4]``."""
+    kind = (torch.arange(rows) % len(LATENTS))[:, None, None]
+    one = torch.nn.functional.one_hot(torch.randint(dim, (rows, states)), dim) > 0
+    scale = torch.ones(rows, states, dim)
+    scale[(kind == 1).expand_as(scale)] = 10.0
+    scale[((kind == 2) & one) | (kind == 3)] = HUGE
+    return scale * torch.randn(rows, states, dim)
+
+
+def describe(
+    head: ConstrainedFlowModule, state: TensorDictBase, keys: Sequence[NestedKey]
+) -> dict[str, Any]:
+    """Return a state ``()`` as plain values: its entries, and each constraint's set."""
+    region = head.get_region(state)
+    assert region.active is not None
+    flags = region.active[1:].tolist()
+    return {
+        "state": {_name(key): plain(state.get(key)) for key in keys},
+        "sets": {
+            name: {"family": type(each).__name__, "active": active, **_plain_fields(each)}
+            for name, each, active in zip(head.order, region.sets[1:], flags, strict=True)
+        },
+    }
+
+
+def _plain_fields(each: ConstraintSet) -> dict[str, Any]:
+    return {name: plain(value) for name, value in each.fields().items()}
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(map(str, key))

@@ -1,0 +1,1 @@
+"""Environments that come with the library, each with geometry, judge and pictures of its own."""

@@ -1,0 +1,166 @@
+r"""The allowed actions of point navigation: a box for the obstacles, a ball for the battery.
+
+Both read the observation only, so that they work on any environment that shows it, and both count
+in action units, the displacement divided by the step length.
+
+**What is guaranteed.** Let n be the charge before a step, and let
+
+.. math:: reach(n) = 0.9\, zone + 0.9\, step\, (n - 1 - threshold)
+
+be what the battery still allows after it, planned with a cautious speed. Let D(p) be the length of
+the way to the nearest station by `ShortestPath`, its turns charged. The two sets together keep
+
+.. math:: D(p) \le reach(n + 1),\quad \text{p outside all rectangles}
+
+from one step to the next for every allowed action, and leave an action open in every such state: 0
+violations, for ever. On the reference layout every start is such a state, the way is the straight
+line to the nearest station, and the safe action lies at least 0.04 action units inside both sets.
+On other layouts it holds from starts with that property, where passages are wider than twice the
+clearance of `ShortestPath`. The obstacle's part alone holds from every position outside the
+rectangles.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, GeometryError
+from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
+from cnfp_torchrl.tasks.point_nav.shortest_path import (
+    CAUTIOUS,
+    MARGIN,
+    ShortestPath,
+    side_distances,
+)
+
+SAFE_SPEED = 0.95
+"""The safe action's length, in steps: between the cautious speed that plans count on and 1."""
+
+_BEYOND = 2.0
+"""Sets for states in which no action keeps the constraint begin here, outside the bounds of 1."""
+
+
+class PointNavGeometry(GeometryTransform):
+    """A constraint of point navigation: reads position and charge, knows the map.
+
+    Args:
+        layout: the map; None takes the reference task.
+        name: the constraint's name; None takes the usual one.
+        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
+    """
+
+    usual_name: ClassVar[str]
+
+    def __init__(
+        self,
+        layout: Layout | None = None,
+        name: str | None = None,
+        observation_key: str = "observation",
+    ) -> None:
+        super().__init__(self.usual_name if name is None else name, [observation_key])
+        self.path = ShortestPath(layout)
+        self.layout = self.path.layout
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return `read_observation` of the states."""
+        return read_observation(tensordict, self.in_keys[0])
+
+
+class ObstacleGeometry(PointNavGeometry):
+    """A box of moves that touch no obstacle and keep the way to the nearest station open.
+
+    For each rectangle the box keeps to the outer side of one of its four edges, prolonged: of those
+    that separate the rectangle from the agent and from the next waypoint, the farthest one. Bounds
+    keep `MARGIN` from edges and walls and are clipped at the action bounds. They are not clamped to
+    contain 0: an agent that rounding left a hair inside the margin is pushed back.
+
+    Where no move keeps the constraint (the agent touches a rectangle, or is out of reach of the
+    arena) the box lies beyond the action bounds, in [2, 3] on the axis of the shortest way out.
+    """
+
+    usual_name = "obstacle"
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Box:
+        """Return the box of allowed moves (docs/method.md, section 4)."""
+        position, _ = self.read(tensordict)
+        distance = side_distances(position, self.path.rectangles)
+        separates = self.path.to_station(position).separates
+        eligible = separates | ~separates.any(-1, keepdim=True)
+        side = torch.where(eligible, distance, -torch.inf).argmax(-1, keepdim=True)
+        chosen = torch.zeros_like(eligible).scatter(-1, side, value=True)
+
+        walls = torch.cat([self.layout.wall - position, self.layout.wall + position], dim=-1)
+        open_to = torch.where(chosen, distance, torch.inf)
+        room = torch.cat([open_to, walls.unsqueeze(-2)], dim=-2).amin(-2) - MARGIN
+        high, low = (room / self.layout.step_length).split(2, dim=-1)
+        low = -low
+
+        touching = (distance <= 0).all(-1, keepdim=True) & chosen
+        leave_x, leave_y = touching.any(-2).unflatten(-1, (2, 2)).any(-2).unbind(-1)
+        beyond = torch.stack([leave_x, leave_y], dim=-1) | (low >= 1) | (high <= -1) | (low >= high)
+        outwards = torch.where(low + high >= 0, 1.0, -1.0) * (_BEYOND + 0.5)
+        return Box(
+            torch.where(beyond, outwards - 0.5, low.clamp(min=-1)),
+            torch.where(beyond, outwards + 0.5, high.clamp(max=1)),
+            validate_args=False,
+        )
+
+
+class BatteryGeometry(PointNavGeometry):
+    r"""The ball around the next waypoint of what the battery still reaches after this step.
+
+    Its radius is :math:`reach(n) - rest`, see the module, with what remains beyond the waypoint;
+    at a waypoint that is no station at least the turning radius. Huge when the battery is full, it
+    closes in on the station as the battery empties.
+
+    It also publishes a candidate safe action: towards the waypoint, 0.95 of a step, not beyond it.
+
+    Where no move keeps the constraint (the charge is at the threshold or below) the ball lies
+    beyond the action bounds, in the direction of the waypoint. Where the station is out of reach it
+    is published all the same, and misses the bounds by itself.
+    """
+
+    usual_name = "battery"
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        """Return the ball of allowed moves (docs/method.md, section 4)."""
+        position, battery = self.read(tensordict)
+        way = self.path.to_station(position)
+        steps_left = battery - 1 - self.layout.battery_threshold
+        reach = CAUTIOUS * (self.layout.zone_radius + self.layout.step_length * steps_left)
+        radius = torch.maximum(reach - way.rest, way.turning_radius) / self.layout.step_length
+        center = (way.waypoint - position) / self.layout.step_length
+
+        lost = steps_left < 0
+        length = torch.linalg.vector_norm(center, dim=-1, keepdim=True)
+        ahead = torch.where(length > 0, center / length, torch.ones_like(center) / 2**0.5)
+        # Radius 1, and sqrt(2) to the corner of the action bounds: from 2 + 2 on they do not meet.
+        far = ahead * length.clamp(min=_BEYOND + 2)
+        return Ball(
+            torch.where(lost.unsqueeze(-1), far, center),
+            torch.where(lost, 1.0, radius),
+            validate_args=False,
+        )
+
+    def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor:
+        """Return the move towards the next waypoint, which is the ball's center."""
+        center = allowed.fields()["center"]
+        length = torch.linalg.vector_norm(center, dim=-1, keepdim=True)
+        return center * (SAFE_SPEED / length.clamp(min=SAFE_SPEED))
+
+
+def read_observation(tensordict: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
+    """Return positions ``(*batch, 2)`` and charges in whole percent, int64 ``(*batch,)``."""
+    observation = tensordict.get(key)
+    if observation.shape[-1] != 5:
+        raise GeometryError(
+            f"key {key!r}: expected (x, y, battery / {BATTERY_FULL}, goal x, goal y), shape "
+            f"(*batch, 5), given shape {tuple(observation.shape)}"
+        )
+    battery = (observation[..., 2] * BATTERY_FULL).round().to(torch.int64)
+    return observation[..., :2], battery
