@@ -49,8 +49,8 @@ def test_density_integrates_to_one_in_the_plane(case: Case) -> None:
     """By the midpoint rule on a grid that is finer towards the anchor, where the density varies.
 
     A grid twice as fine has about a third of the error, which is measured to be half of what is
-    allowed here. A chain's image is narrow in its last set, and an anchor 1e-4 from a boundary needs
-    a much finer grid there: those get less far.
+    allowed here. A chain's image is narrow in its last set, and an anchor 1e-4 from a boundary
+    needs a much finer grid there: those get less far.
     """
     count, power, close = 160, 2, 2e-3
     if case.kind == "chain":

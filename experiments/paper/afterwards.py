@@ -63,8 +63,8 @@ def changed(config: DictConfig, change: Callable[[Layout], Layout]) -> DictConfi
     nodes = list(_layouts(content))
     if not nodes:
         raise ValueError(
-            "config: expected an environment with a cnfp_torchrl.tasks.point_nav.Layout, given one without; "
-            "only point navigation can be changed afterwards"
+            "config: expected an environment with a cnfp_torchrl.tasks.point_nav.Layout, given "
+            "one without; only point navigation can be changed afterwards"
         )
     for node in nodes:
         layout = change(instantiate(OmegaConf.create(node), _convert_="all"))

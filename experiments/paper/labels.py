@@ -35,8 +35,7 @@ LABELS = {
     "lagrangian": Label("SAC-Lagrangian", "#E69F00", "o", baseline=True),
     "lagrangian_threshold": Label("SAC-Lagrangian, small threshold", "#B2182B", "<", baseline=True),
     "penalty": Label("reward penalty", "#8C510A", "v", baseline=True),
-    "unconstrained": Label("unconstrained SAC", "#6E6E6E", "X"),
-    "unconstrained": Label("action bounds alone", "#3A3A3A", "x"),
+    "unconstrained": Label("unconstrained", "#6E6E6E", "X"),
 }
 """In the order in which they are shown."""
 

@@ -160,5 +160,5 @@ def spread_labels(
             fontsize=_NAME_SIZE,
             arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.5, "shrinkB": 5,
                         "relpos": (0.0 if side > 0 else 1.0, 0.5)},
-            bbox={"facecolor": "white", "edgecolor": "unconstrained", "pad": 0.6, "alpha": 0.75},
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.75},
         )  # fmt: skip

@@ -306,6 +306,7 @@ def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield "\n".join(f"- {each}" for each in gathered.problems) or "Nothing."
     yield "## How it was measured"
     yield configurations_table(runs)
+    yield "Names of classes are those of the commits."
     yield provenance(runs)
 
 

@@ -182,8 +182,8 @@ def element(each: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]
     return type(each)(**values)
 
 
-# Random sets around an anchor. All numbers are rounded to float32, so that both dtypes mean the same
-# sets; the slack of the anchor is what remains after that.
+# Random sets around an anchor. All numbers are rounded to float32, so that both dtypes mean the
+# same sets; the slack of the anchor is what remains after that.
 
 
 class Maker:
