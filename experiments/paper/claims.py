@@ -14,6 +14,7 @@ from experiments.paper.intersections import Tried, incompatible, intersecting
 from experiments.paper.labels import label
 from experiments.paper.records import HostileRun, Record
 from experiments.paper.statistics import (
+    TARGET_SCORE,
     Interval,
     area_under_score,
     difference,
@@ -124,7 +125,8 @@ def satisfaction(runs: Runs, yes: float = 0.0, partly: float = QUASI) -> Finding
     counts = [run.violations for run in runs]
     steps = [run.steps + sum(each.steps for each in run.evaluation.both) for run in runs]
     worst = max(count / taken for count, taken in zip(counts, steps, strict=True))
-    measured = f"{sum(counts):,} violating of {sum(steps):,} steps in {len(runs)} runs"
+    number = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    measured = f"{sum(counts):,} violating of {sum(steps):,} steps in {number}"
     measured += f", in the worst run {100 * worst:.2g} %" if worst else ""
     return Finding(_up_to(worst, yes, partly), measured)
 
@@ -301,27 +303,27 @@ FLOW_CLAIMS = (
     ),
     Claim(
         "Constraints are satisfied nearly perfectly from the first step of training to the last.",
-        "reproduced while no run has more than 1 violating step in 1,000, evaluations included; "
-        "partly up to 1 in 100; else not",
+        f"reproduced while no run has more than {QUASI:.1%} of violating steps, evaluations "
+        f"included; partly up to {10 * QUASI:.0%}; else not",
         lambda e, flow: satisfaction(e.one(flow), QUASI, 10 * QUASI),
     ),
     Claim(
         "They are satisfied perfectly, as the same results are summed up.",
         "reproduced without a violating step in any run, evaluations included; partly while no run "
-        "has more than 1 in 1,000; else not",
+        f"has more than {QUASI:.1%} of them; else not",
         lambda e, flow: satisfaction(e.one(flow)),
     ),
     Claim(
         "The final return comes up to that of an agent that ignores the constraints.",
         "reproduced unless the interval of the difference of scores lies below 0; then partly from "
-        "0.9 times its score on; else not (here the other passes through the rectangle and never "
-        "has to charge: breaking the rules pays)",
+        f"{PAR:g} times its score on; else not (here the other passes through the rectangle and "
+        "never has to charge: breaking the rules pays)",
         lambda e, flow: on_par(e.one(flow), e.one("unconstrained"), score),
     ),
     Claim(
         "It learns as quickly as an agent that ignores the constraints.",
-        "steps to a training score of 0.75: reproduced unless the interval of the difference lies "
-        "above 0; then partly up to 1.5 times the steps; else not",
+        f"steps to a training score of {TARGET_SCORE:g}: reproduced unless the interval of the "
+        f"difference lies above 0; then partly up to {SLOWER:g} times the steps; else not",
         lambda e, flow: as_fast(e.one(flow), e.one("unconstrained")),
     ),
     Claim(
@@ -332,9 +334,9 @@ FLOW_CLAIMS = (
     ),
     Claim(
         "It learns faster than with a reward penalty and with SAC-Lagrangian.",
-        "steps saved to a training score of 0.75: reproduced if both intervals lie above 0; partly "
-        "if one does and none lies below; else not; a run that never came there counts with its "
-        "whole budget, which is less than it would have needed",
+        f"steps saved to a training score of {TARGET_SCORE:g}: reproduced if both intervals lie "
+        "above 0; partly if one does and none lies below; else not; a run that never came there "
+        "counts with its whole budget, which is less than it would have needed",
         lambda e, flow: faster(e.one(flow), e.of(*PENALIZED)),
     ),
     Claim(
@@ -356,8 +358,8 @@ BASELINE_CLAIMS = (
     ),
     Claim(
         "The penalty and SAC-Lagrangian reduce violations drastically over training.",
-        "violating steps per episode, first to last tenth: reproduced if both fall 10 times; "
-        "partly if both fall 2 times; else not",
+        "violating steps per episode, first to last tenth: reproduced if both fall "
+        f"{FALL:g} times; partly if both fall {SOME_FALL:g} times; else not",
         lambda e, _: falls(e.of(*PENALIZED)),
     ),
     Claim(
@@ -374,7 +376,8 @@ AIMS = (
     Claim(
         "The exact flow: no violation in any run, from the first step to the last, evaluations "
         "included.",
-        "met without a single one; partly while no run has more than 1 in 1,000 steps; else not",
+        f"met without a single one; partly while no run has more than {QUASI:.1%} of violating "
+        "steps; else not",
         lambda e, flow: satisfaction(e.one(flow)),
     ),
     Claim(
@@ -391,7 +394,8 @@ AIMS = (
     ),
     Claim(
         "SAC-Lagrangian really trains: its violations per episode fall at least ten times.",
-        "first to last tenth of training: met from 10 times on; partly from 2 times on; else not",
+        f"first to last tenth of training: met from {FALL:g} times on; partly from "
+        f"{SOME_FALL:g} times on; else not",
         lambda e, _: falls(e.of("lagrangian")),
     ),
     Claim(

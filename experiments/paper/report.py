@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,6 @@ from experiments.paper.claims import (
 from experiments.paper.figures_flow import UNTRAINED, KeptPolicy, find_policy, flow_figures
 from experiments.paper.figures_mappings import draw_mappings
 from experiments.paper.figures_methods import (
-    Runs,
     draw_afterwards,
     draw_hostile,
     draw_summary,
@@ -38,6 +37,7 @@ from experiments.paper.figures_methods import (
 )
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import HostileRuns, RecordError, by_method, load_records
+from experiments.paper.statistics import TARGET_SCORE
 from experiments.paper.tables import (
     afterwards_table,
     configurations_table,
@@ -184,11 +184,14 @@ def judge(evidence: Evidence) -> Iterator[Judged]:
 def _page(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     evidence, problems = gathered.evidence, gathered.problems
     runs, source = evidence.runs, gathered.policy.source
+    every = [run for records in runs.values() for run in records]
+    episodes = _values(run.evaluation.stochastic.episodes for run in every)
     yield "# The paper's experiment, repeated"
     yield (
         "Constrained 2D point navigation ([Rietz et al. 2024](https://arxiv.org/abs/2405.01198)) "
         "with the methods of the paper, the exact flow of this library and a projection: "
-        f"{_budget(runs)}. A command writes this page from the records in [data](data), every "
+        f"{len(every)} runs, of {_values(run.steps for run in every)} environment steps each. A "
+        "command writes this page from the records in [data](data), every "
         "verdict by a [rule](details.md#claims-and-rules); no number and no verdict is written by "
         "hand."
     )
@@ -199,10 +202,10 @@ def _page(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield methods_table(runs)
     yield (
         "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. Score 0 is "
-        "standing still, 1 a heuristic planner projected into the sets; 400 episodes after "
-        "training. Steps: until the score in training first was 0.75; where some run never was, "
-        "how many were. Violating steps: of training and evaluations, all constraints together. "
-        "[All numbers](details.md#all-numbers)."
+        f"standing still, 1 a heuristic planner projected into the sets; {episodes} episodes after "
+        f"training. Steps: until the score in training first was {TARGET_SCORE:g}; where some run "
+        "never was, how many were. Violating steps: of training and evaluations, all constraints "
+        "together. [All numbers](details.md#all-numbers)."
     )
     yield _image(
         "trade_off",
@@ -301,7 +304,7 @@ def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield afterwards_table(runs)
     yield "### Behind hostile networks"
     yield hostile_table(evidence.hostile)
-    yield "Each network is in [hostile_networks.md](../results/hostile_networks.md)."
+    yield "Each network is in `experiments/results/hostile_networks.md`."
     yield "## What was left out"
     yield "\n".join(f"- {each}" for each in gathered.problems) or "Nothing."
     yield "## How it was measured"
@@ -322,14 +325,10 @@ def _claims(head: Sequence[str], judged: Sequence[Judged]) -> str:
     return table(["", *head], rows)
 
 
-def _budget(runs: Runs) -> str:
-    seeds = sorted({len(records) for records in runs.values()})
-    steps = sorted({run.steps for records in runs.values() for run in records})
-    return f"{_range(seeds)} seeds a method, {_range(steps)} environment steps a run"
-
-
-def _range(numbers: Sequence[int]) -> str:
-    return " to ".join(f"{each:,}" for each in dict.fromkeys((numbers[0], numbers[-1])))
+def _values(numbers: Iterable[int]) -> str:
+    """Return the smallest and the largest of some numbers in words, once where they agree."""
+    ordered = sorted(numbers)
+    return " to ".join(f"{each:,}" for each in dict.fromkeys((ordered[0], ordered[-1])))
 
 
 def _image(name: str, title: str, caption: str) -> str:
