@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
 from torch.distributions.utils import _standard_normal
 
-from cnfp_torchrl.bijectors import Bijector, Stages
+from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
 from cnfp_torchrl.geometry.shapes import broadcast_shape
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
@@ -89,9 +89,15 @@ class ConstrainedFlow(TransformedDistribution):
         the density's limit is taken: -inf.
         """
         inside, undefined = self.bijector.contains(value), value.isnan().any(-1)
-        interior = self.bijector(torch.zeros_like(value))
+        # Replaced before the inversion, because NaN would reach the gradients through `torch.where`
+        # after it; by the action of a unit latent, because at 0 some bijectors are not smooth.
+        interior = self.bijector(torch.full_like(value, value.shape[-1] ** -0.5))
         inside_value = torch.where(inside.unsqueeze(-1), value, interior)
         latent, log_det = self.bijector.inverse_and_log_det(inside_value)
+        # What is scored decides. It may round otherwise than the same inversion did in `contains`,
+        # where an action that is broadcast to a batch of sets had another memory layout.
+        inside = inside & has_latent(latent, log_det)
+        latent = torch.where(inside.unsqueeze(-1), latent, 0)
         elsewhere = torch.where(undefined, torch.nan, -torch.inf).to(log_det)
         return torch.where(inside, _log_prob(self.base_dist, latent) + log_det, elsewhere)
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 BIN = Path(sys.executable).parent
 TINY = [
@@ -52,6 +53,10 @@ def test_everything_of_a_run_is_in_its_folder(folder: Path) -> None:
     names = {path.name for path in place.iterdir()}
     assert names >= {"config.yaml", "checkpoint.pt", "summary.json", "metrics", ".hydra"}
     assert [path.name for path in folder.iterdir()] == ["outputs"]
+    asked = {path.stem: OmegaConf.load(path) for path in (place / ".hydra").iterdir()}
+    assert asked["overrides"] == TINY
+    assert asked["config"].evaluation.episodes == 2
+    assert asked["hydra"].hydra.job.name == "train"
 
 
 def test_evaluate_prints_a_table_and_writes_it(folder: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import require_settings
+from cnfp_torchrl.whole_file import whole_file
 
 FLAWS_FOUND = 3
 """The exit code where flaws were found; 1 is an audit that could not be done."""
@@ -48,7 +49,8 @@ def main(config: DictConfig) -> None:
     report = audit_configured(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     text = json.dumps(report.as_dict(), indent=2, allow_nan=False)
-    (folder / "audit.json").write_text(text + "\n")
+    with whole_file(folder / "audit.json") as file:
+        file.write(f"{text}\n".encode())
     draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
     if draw is not None:
         draw(report, folder / "audit.png")

@@ -2,7 +2,7 @@
 
 from cnfp_torchrl.bijectors.aligned_squash import ExactSquash
 from cnfp_torchrl.bijectors.ball_squash import BallSquash
-from cnfp_torchrl.bijectors.bijector import Bijector, Stages
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages, has_latent
 from cnfp_torchrl.bijectors.box_squash import BoxSquash
 from cnfp_torchrl.bijectors.chain import SquashChain
 from cnfp_torchrl.bijectors.ellipsoid_squash import EllipsoidSquash
@@ -27,5 +27,6 @@ __all__ = [
     "ShellSquash",
     "SquashChain",
     "Stages",
+    "has_latent",
     "paper_squash",
 ]

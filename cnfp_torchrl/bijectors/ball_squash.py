@@ -18,7 +18,10 @@ def squash_to_unit_ball(latent: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def unsquash_from_unit_ball(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the latent of a point of the open unit ball and the inverse's log-determinant."""
+    """Return the latent of a point and the inverse's log-determinant.
+
+    Outside the open unit ball both are infinite or NaN.
+    """
     latent = point * atanhc(point.square().sum(-1)).unsqueeze(-1)
     return latent, -radial_log_det(latent.square().sum(-1), latent.shape[-1])
 
@@ -59,11 +62,6 @@ class BallSquash(Bijector):
         return action, log_det + latent.shape[-1] * self._ball.radius.log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        latent, log_det = unsquash_from_unit_ball(self._unit_point(action))
+        point = (action - self._ball.center) / self._ball.radius.unsqueeze(-1)
+        latent, log_det = unsquash_from_unit_ball(point)
         return latent, log_det - action.shape[-1] * self._ball.radius.log()
-
-    def contains(self, action: Tensor) -> Tensor:
-        return self._unit_point(action).square().sum(-1) < 1
-
-    def _unit_point(self, action: Tensor) -> Tensor:
-        return (action - self._ball.center) / self._ball.radius.unsqueeze(-1)

@@ -39,10 +39,10 @@ class Bijector(Transform):
     """A bijection from R^d onto a set of actions, batched, one set for each batch element.
 
     Latent and action have shape ``(*batch, d)``, log-determinants ``(*batch,)``; parameters
-    broadcast against the batch. A bijector states `forward_and_log_det`, `inverse_and_log_det`,
-    `contains` and the `shape` of its parameters; one with several stages also `stages`. Everything
-    that `torch.distributions` asks of a transform follows from these. It is not verified that
-    forward and inverse agree; the tests do that for every bijector of this package.
+    broadcast against the batch. A bijector states `forward_and_log_det`, `inverse_and_log_det` and
+    the `shape` of its parameters; one with several stages also `stages`. Everything that
+    `torch.distributions` asks of a transform follows from these. It is not verified that forward
+    and inverse agree; the tests do that for every bijector of this package.
     """
 
     bijective = True
@@ -59,13 +59,19 @@ class Bijector(Transform):
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latent of an action and log|det d latent / d action|.
 
-        Only for actions of the image. Where tanh is saturated in the dtype the latent is infinite:
-        score samples together with drawing them instead.
+        Outside the image, and on its boundary, a component of the latent is infinite or NaN. A
+        saturated action lies there too, as far as its dtype can tell: score samples together with
+        drawing them instead.
         """
 
-    @abstractmethod
     def contains(self, action: Tensor) -> Tensor:
-        """Tell whether each action lies in the image, an open set: its boundary has no latent."""
+        """Tell whether each action lies in the image, an open set: its boundary has no latent.
+
+        The inverse decides. A comparison of its own would round differently, and accept actions
+        whose latent is infinite.
+        """
+        with torch.no_grad():
+            return has_latent(*self.inverse_and_log_det(action))
 
     @property
     def shape(self) -> torch.Size:
@@ -99,6 +105,11 @@ class Bijector(Transform):
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Return log|det dy/dx| at the latent x; y is not used."""
         return self.forward_and_log_det(x)[1]
+
+
+def has_latent(latent: Tensor, log_det: Tensor) -> Tensor:
+    """Tell where an inversion has found a latent ``(*batch, d)`` with a density, ``(*batch,)``."""
+    return latent.isfinite().all(-1) & log_det.isfinite()
 
 
 def log_det_zero(value: Tensor) -> Tensor:

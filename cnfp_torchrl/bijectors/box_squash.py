@@ -93,8 +93,5 @@ class BoxSquash(Bijector):
         latent, log_slopes = self.inverse_and_log_slopes(action)
         return latent, -log_slopes.sum(-1)
 
-    def contains(self, action: Tensor) -> Tensor:
-        return (((action - self._middle) / self._half).abs() < 1).all(-1)
-
     def _log_slopes(self, latent: Tensor) -> Tensor:
         return torch.add(self._log_slope_scale, log_half_sech(latent), alpha=2)

@@ -49,15 +49,6 @@ class SquashChain(Bijector):
             total = total + log_det
         return latent, total
 
-    def contains(self, action: Tensor) -> Tensor:
-        inside = torch.ones_like(action[..., 0], dtype=torch.bool)
-        for bijector in reversed(self.bijectors):
-            inside = inside & bijector.contains(action)
-            interior = bijector.forward_and_log_det(torch.zeros_like(action))[0]
-            action = torch.where(inside.unsqueeze(-1), action, interior)
-            action = bijector.inverse_and_log_det(action)[0]
-        return inside
-
     def stages(self, latent: Tensor) -> Stages:
         action = latent.expand(broadcast_shape(latent.shape, self.shape))
         total = log_det_zero(action)

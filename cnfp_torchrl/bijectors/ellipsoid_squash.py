@@ -52,14 +52,9 @@ class EllipsoidSquash(Bijector):
         return self._ellipsoid.center + offset, log_det + self._log_volume()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        latent, log_det = unsquash_from_unit_ball(self._unit_point(action))
+        point = self._ellipsoid.whiten(action - self._ellipsoid.center)
+        latent, log_det = unsquash_from_unit_ball(point)
         return latent, log_det - self._log_volume()
-
-    def contains(self, action: Tensor) -> Tensor:
-        return self._unit_point(action).square().sum(-1) < 1
-
-    def _unit_point(self, action: Tensor) -> Tensor:
-        return self._ellipsoid.whiten(action - self._ellipsoid.center)
 
     def _log_volume(self) -> Tensor:
         return _diagonal(self._ellipsoid).log().sum(-1)

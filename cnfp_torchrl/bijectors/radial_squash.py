@@ -55,12 +55,6 @@ class RadialSquash(Bijector):
         log_det = radial_log_det(rho.square(), action.shape[-1])
         return latent, action.shape[-1] * (gauge / length).log() - log_det
 
-    def contains(self, action: Tensor) -> Tensor:
-        offset = action - self.region.anchor
-        direction, zero = scaled_direction(offset)
-        _, gauge = self.region.outer_and_inner_gauge(direction)
-        return (offset.abs().amax(-1) * gauge < 1) | zero
-
     def stages(self, latent: Tensor) -> Stages:
         direction, _ = scaled_direction(latent)
         return Stages(*self._stretch(latent, direction, self.region.gauges(direction)))

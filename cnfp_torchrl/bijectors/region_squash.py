@@ -68,9 +68,6 @@ class RegionSquash(Bijector):
         latent, box_log_det = self._box.inverse_and_log_det(offset)
         return latent, log_det + box_log_det
 
-    def contains(self, action: Tensor) -> Tensor:
-        return self._box.contains(self._retraction.inverse(action))
-
     def stages(self, latent: Tensor) -> Stages:
         offset, log_slopes = self._box.forward_and_log_slopes(latent)
         sets = self.region.sets
@@ -127,29 +124,20 @@ class _Retraction:
             log_det = torch.sub(log_det, contraction.log(), alpha=offset.shape[-1])
         return self._contracted(scaled, contraction), log_det
 
-    def inverse(self, action: Tensor) -> Tensor:
-        """Return the offset of an action."""
-        return self._offset_and_contraction(action)[0]
-
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the offset of an action, and the log-determinant of the way back to it."""
-        offset, contraction = self._offset_and_contraction(action)
-        log_det = torch.zeros_like(offset[..., 0])
-        if contraction is not None:
-            log_det = offset.shape[-1] * contraction.log()
-        if self._scale is not None:
-            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
-        return offset, log_det
-
-    def _offset_and_contraction(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         offset = action - self._anchor
         if self._scale is not None:
             offset = self._scale.inverse(offset)
         # It depends on the direction alone, as the component scale does.
         _, contraction = self._scaled_and_contraction(offset)
+        log_det = torch.zeros_like(offset[..., 0])
         if contraction is not None:
             offset = offset * contraction.unsqueeze(-1)
-        return offset, contraction
+            log_det = offset.shape[-1] * contraction.log()
+        if self._scale is not None:
+            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
+        return offset, log_det
 
     def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the offset after the boxes, and by what it is to be divided for other sets."""

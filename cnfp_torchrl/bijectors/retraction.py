@@ -41,19 +41,18 @@ class Retraction(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         offset = latent - self._anchor
-        contraction = self._contraction(offset)
+        _, contraction = self._progress_and_contraction(offset)
         action = self._anchor + offset / contraction.unsqueeze(-1)
         return action, -latent.shape[-1] * contraction.log()
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         offset = action - self._anchor
-        contraction = self._contraction(offset)
+        progress, contraction = self._progress_and_contraction(offset)
+        # A way that leaves the outer set has no argument.
+        contraction = torch.where(progress * contraction < 1, contraction, torch.nan)
         latent = self._anchor + offset * contraction.unsqueeze(-1)
         return latent, action.shape[-1] * contraction.log()
 
-    def contains(self, action: Tensor) -> Tensor:
-        offset = action - self._anchor
-        return self._outer_gauge(offset) * self._contraction(offset) < 1
-
-    def _contraction(self, offset: Tensor) -> Tensor:
-        return Rays(offset, self._outer_gauge(offset)).contraction([self._inner_gauge])
+    def _progress_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor]:
+        progress = self._outer_gauge(offset)
+        return progress, Rays(offset, progress).contraction([self._inner_gauge])

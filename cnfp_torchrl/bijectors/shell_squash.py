@@ -75,15 +75,11 @@ class ShellSquash(Bijector):
         offset = action - self._center
         direction, unit_length, width = self._rays(offset)
         radius = vector_norm(offset, dim=-1)
-        rho = ((radius - self._inner) / width).atanh()
+        depth = (radius - self._inner) / width
+        # The hole has no latent, whereas artanh has negative values.
+        rho = torch.where(depth > 0, depth, torch.nan).atanh()
         latent = direction * (rho / unit_length).unsqueeze(-1)
         return latent, -self._log_det(rho, radius, width, action.shape[-1])
-
-    def contains(self, action: Tensor) -> Tensor:
-        offset = action - self._center
-        _, _, width = self._rays(offset)
-        depth = (vector_norm(offset, dim=-1) - self._inner) / width
-        return (depth > 0) & (depth < 1)
 
     def _rays(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return direction, its length, and the width of the shell along it."""

@@ -117,7 +117,10 @@ def load_actor(
         folder: the run.
         config: its configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
+
+    Raises:
+        ValueError: when the run's checkpoint is not that of such an actor.
     """
     actor = build_actor(config, env)
-    actor.load_state_dict(folder.load_checkpoint()["actor"])
+    folder.restore(actor=actor)
     return actor.eval()

@@ -22,6 +22,7 @@ from cnfp_torchrl.training.evaluation import Policy, evaluate_seeded
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings, require_settings
 from cnfp_torchrl.training.watching import RECORDING, Watch, watch_run
+from cnfp_torchrl.whole_file import whole_file
 
 
 def evaluate_run(
@@ -93,7 +94,9 @@ def _report(
     reports = evaluate_run(folder, settings, trusted=trusted)
     output = place / "evaluation.json"
     document = {"run": str(folder.path), "seed": settings.seed, "policies": reports}
-    output.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+    text = json.dumps(document, indent=2, allow_nan=False)
+    with whole_file(output) as file:
+        file.write(f"{text}\n".encode())
     sys.stdout.write(f"{table(reports)}\n{output}\n")
 
 

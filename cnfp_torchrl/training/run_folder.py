@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Iterator, Sequence
+import os
+import pickle
+import weakref
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +15,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
+from cnfp_torchrl.training.trust import BUILT, read_plain, require_trusted, targets
+from cnfp_torchrl.whole_file import whole_file
 
-TRUSTED_TARGETS = ("cnfp_torchrl.", "torchrl.envs.GymEnv")
-"""What a stranger's configuration may instantiate; nothing that reads or runs a file."""
+CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
 
 
 class RunFolder:
@@ -26,23 +30,46 @@ class RunFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self._release: Callable[[], Any] | None = None
+
+    def close(self) -> None:
+        """Let go of the folder; a run that has started keeps it by its configuration."""
+        if self._release is not None:
+            self._release()
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
-        """Return a new run's folder, made if need be.
+        """Return a new run's folder, made if need be and held until closed, or gone.
 
         Raises:
-            FileExistsError: when the folder holds a run already.
+            FileExistsError: when the folder holds a run already, or another process holds it.
         """
         folder = cls(path)
-        held = [n for n in (CONFIG, CHECKPOINT, SUMMARY) if (folder.path / n).exists()]
-        if held:
-            raise FileExistsError(
-                f"expected an empty folder for the run, but {folder.path} holds {held} of another; "
-                "give a new one with hydra.run.dir=PATH or leave it out"
-            )
         folder.path.mkdir(parents=True, exist_ok=True)
+        expected = "expected an empty folder for the run"
+        remedy = "give a new one with hydra.run.dir=PATH or leave it out"
+        if not folder._hold():
+            raise FileExistsError(f"{expected}, but another run works in {folder.path}; {remedy}")
+        if held := [n for n in (CONFIG, CHECKPOINT, SUMMARY) if (folder.path / n).exists()]:
+            folder.close()
+            raise FileExistsError(
+                f"{expected}, but {folder.path} holds {held} of another; {remedy}"
+            )
         return folder
+
+    def _hold(self) -> bool:
+        """Lock the folder itself, which leaves nothing in it, and tell whether nobody else did."""
+        handle = os.open(self.path, os.O_RDONLY)
+        self._release = weakref.finalize(self, os.close, handle)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            return False
+        except OSError:
+            # Some network file systems cannot lock a folder: there `save_config` decides, later.
+            self.close()
+        return True
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
@@ -56,61 +83,110 @@ class RunFolder:
         if missing:
             raise FileNotFoundError(
                 f"run: expected the folder of a finished run with {CONFIG} and {CHECKPOINT}, but "
-                f"{folder.path} lacks {missing}"
+                f"{folder.path} lacks {missing}; give the folder that training printed when it "
+                "ended, or train again"
             )
         return folder
 
     def save_config(self, config: DictConfig) -> None:
-        """Write the configuration with every interpolation resolved."""
-        OmegaConf.save(config, self.path / CONFIG, resolve=True)
-
-    def load_config(self, trusted: Sequence[str] = ()) -> DictConfig:
-        """Read the configuration.
-
-        Args:
-            trusted: prefixes of further importable names that may be instantiated, such as
-                ``my_package.envs.``.
+        """Write the configuration with every interpolation resolved.
 
         Raises:
-            PermissionError: when it would instantiate anything else.
+            FileExistsError: when another run has written its own in the meantime.
         """
-        config = OmegaConf.load(self.path / CONFIG)
-        if not isinstance(config, DictConfig):
-            raise ValueError(f"{self.path / CONFIG}: expected a mapping, given {type(config)}")
-        allowed = (*TRUSTED_TARGETS, *trusted)
-        for section in ("env", "flow", "network"):
-            content = OmegaConf.to_container(config[section], resolve=True)
-            for target in _targets(content):
-                if not target.startswith(allowed):
-                    raise PermissionError(
-                        f"{self.path / CONFIG}, section '{section}': expected targets that start "
-                        f"with one of {list(allowed)}, given {target!r}; if you trust this run, "
-                        "add its prefix: trusted=[...]"
-                    )
-        return config
+        self._write(CONFIG, OmegaConf.to_yaml(config, resolve=True), exclusive=True)
+
+    def load_settings(self) -> dict[str, Any]:
+        """Read the configuration as plain data, to be compared or shown but not built.
+
+        Raises:
+            ValueError: when it is not plain YAML.
+        """
+        return read_plain(self.path / CONFIG)
+
+    def load_config(self, trusted: Sequence[str] = ()) -> DictConfig:
+        """Read what the run can be built from: no section of it names anything untrusted.
+
+        Sections of training alone, such as the optimizer's, are left out; `load_settings` has them.
+
+        Args:
+            trusted: packages, modules or objects that may be named beside what the shipped
+                configuration names, such as ``my_package.envs.``.
+
+        Raises:
+            ValueError: when it is not plain YAML or lacks a section.
+            PermissionError: when it would do anything else than build what it may name.
+        """
+        path = self.path / CONFIG
+        content = read_plain(path)
+        if missing := [each for each in BUILT[:3] if each not in content]:
+            raise ValueError(
+                f"{path}: expected the sections {list(BUILT[:3])} of a training run, but {missing} "
+                "are missing; give the folder that training printed when it ended"
+            )
+        content = {
+            name: section
+            for name, section in content.items()
+            if name in BUILT or not any(True for _ in targets(section))
+        }
+        require_trusted(content, trusted, path)
+        return OmegaConf.create(content)
 
     def save_checkpoint(self, **modules: nn.Module | torch.optim.Optimizer) -> None:
         """Write the state dicts of modules and optimizers under their names."""
         state = {name: module.state_dict() for name, module in modules.items()}
-        torch.save(state, self.path / CHECKPOINT)
+        with whole_file(self.path / CHECKPOINT) as file:
+            torch.save(state, file)
 
     def load_checkpoint(self) -> dict[str, Any]:
-        """Read the state dicts; tensors and plain containers only, so no code can run."""
-        return torch.load(self.path / CHECKPOINT, weights_only=True)
+        """Read the state dicts; tensors and plain containers only, so no code can run.
+
+        Raises:
+            ValueError: when there is none, or it is not a whole checkpoint.
+        """
+        path = self.path / CHECKPOINT
+        if not path.is_file():
+            raise self._unusable("is not there")
+        if not path.stat().st_size:
+            raise self._unusable("is empty")
+        # Not from the cause: PyTorch advises to load what it refused in a way that runs code.
+        try:
+            state = torch.load(path, weights_only=True, map_location="cpu")
+        except pickle.UnpicklingError:
+            raise self._unusable("holds something else than tensors and plain containers") from None
+        except Exception:  # the readers of its formats fail in any way
+            raise self._unusable("is cut short, or no checkpoint at all") from None
+        if not isinstance(state, dict):
+            raise self._unusable(f"holds a {type(state).__name__}")
+        return state
+
+    def restore(self, **modules: nn.Module) -> None:
+        """Give modules the states that `save_checkpoint` wrote under their names.
+
+        Raises:
+            ValueError: when the checkpoint is unusable, or of modules of other names or sizes.
+        """
+        state = self.load_checkpoint()
+        for name, module in modules.items():
+            if name not in state:
+                raise self._unusable(f"has no {name!r}, but {sorted(map(str, state))}")
+            try:
+                module.load_state_dict(state[name])
+            except Exception as error:  # so does what is no state at all
+                raise self._unusable(f"has another {name!r} than {CONFIG}", error) from error
+
+    def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
+        said = "" if error is None else f" ({type(error).__name__}: {error})"
+        return ValueError(
+            f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
+            f"{CONFIG}, but it {what}{said}; copy both anew from where the run was trained, or "
+            "train again"
+        )
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write the summary."""
-        text = json.dumps(summary, indent=2, allow_nan=False)
-        (self.path / SUMMARY).write_text(text + "\n")
+        self._write(SUMMARY, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
-
-def _targets(content: Any) -> Iterator[str]:
-    if isinstance(content, dict):
-        for key, value in content.items():
-            if key == "_target_":
-                yield str(value)
-            else:
-                yield from _targets(value)
-    elif isinstance(content, list):
-        for value in content:
-            yield from _targets(value)
+    def _write(self, name: str, text: str, *, exclusive: bool = False) -> None:
+        with whole_file(self.path / name, exclusive=exclusive) as file:
+            file.write(text.encode())

@@ -12,7 +12,7 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
@@ -37,6 +37,7 @@ from cnfp_torchrl.training.watching import (
     Watch,
     first_episodes,
 )
+from cnfp_torchrl.whole_file import whole_file
 
 
 def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
@@ -52,6 +53,11 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     Raises:
         ValueError: before any work, for a setting that makes no sense.
     """
+    with closing(folder):
+        return _train(config, folder)
+
+
+def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     started = time.perf_counter()
     require_settings(config)
     settings: TrainingSettings = instantiate(config.training)
@@ -178,10 +184,26 @@ def _results(
     }
 
 
+def _keep_what_was_asked(folder: RunFolder, config: DictConfig) -> None:
+    """Write what Hydra would, who would write it over that of a run whose folder it is."""
+    hydra_config = HydraConfig.get()
+    asked = {
+        "config": config,
+        "hydra": {"hydra": hydra_config},
+        "overrides": hydra_config.overrides.task,
+    }
+    place = folder.path / ".hydra"
+    place.mkdir(exist_ok=True)
+    for name, content in asked.items():
+        with whole_file(place / f"{name}.yaml") as file:
+            file.write(OmegaConf.to_yaml(content).encode())
+
+
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
 def main(config: DictConfig) -> float | None:
     """Run `train` for a Hydra configuration, draw its figures and print the summary."""
     folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
+    _keep_what_was_asked(folder, config)
     summary = train(config, folder)
     if config.figures:
         instantiate(config.figures)(folder)

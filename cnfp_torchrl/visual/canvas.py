@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
 from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
+from cnfp_torchrl.whole_file import whole_file
 
 _STYLE: dict[RcKeyType, Any] = {
     "font.family": "DejaVu Sans",
@@ -57,8 +58,8 @@ def new_figure(width: float, height: float) -> Figure:
 def save_png(figure: Figure, path: Path, *, dpi: int = 130) -> Path:
     """Write a figure as PNG and return where it is."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with house_style():
-        figure.savefig(path, dpi=dpi, format="png")
+    with house_style(), whole_file(path) as file:
+        figure.savefig(file, dpi=dpi, format="png")
     return path
 
 

@@ -106,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--trusted",
         action="append",
         default=[],
-        metavar="PREFIX",
-        help="of further names that the run's configuration may instantiate",
+        metavar="PACKAGE",
+        help="that the run's configuration may name beside this one, such as my_package.",
     )
     given = parser.parse_args(arguments)
     options = vars(given)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import SquashChain
+from cnfp_torchrl.bijectors import SquashChain, has_latent
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.modules.constraint_bijector import require
@@ -64,7 +64,7 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     region = in_float64(snapshot.region)
     staged = StagedFlow(snapshot.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
-    latent = staged.inverse(given[None])[0][-1]
+    latent, inverse_log_det = (each[-1] for each in staged.inverse(given[None]))
     path, log_dets = staged.forward(latent)
     path = path.squeeze(1)
     if isinstance(staged.last, SquashChain):
@@ -76,9 +76,11 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
         path = given.expand(len(snapshot.stages), -1)
     path = torch.cat([path[:-1], given[None]])
     samples = _before(path[:, None], torch.stack([stage.samples for stage in snapshot.stages]))
-    log_density = _before(
-        latent_log_density - log_dets, torch.stack([each.log_density for each in snapshot.stages])
+    # A saturated action has lost its latent: as the distribution does, take the density's limit.
+    of_action = (latent_log_density - log_dets).masked_fill(
+        ~has_latent(latent, inverse_log_det), -torch.inf
     )
+    log_density = _before(of_action, torch.stack([each.log_density for each in snapshot.stages]))
     stages = tuple(
         replace(stage, samples=samples[i], log_density=log_density[i])
         for i, stage in enumerate(snapshot.stages)

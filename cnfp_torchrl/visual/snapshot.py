@@ -13,6 +13,7 @@ from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.bijectors import has_latent
 from cnfp_torchrl.geometry import ConstraintSet, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
 from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY
@@ -192,8 +193,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     @torch.no_grad()
     def log_densities(actions: Tensor) -> Tensor:
         latents, log_dets = staged.inverse(actions.to(loc))
-        # Actions outside the image have no latent, and the inverse of tanh says so by its NaN.
-        outside = ~latents.isfinite().all(-1)
+        outside = ~has_latent(latents, log_dets)
         return (base.log_prob(latents) + log_dets).masked_fill(outside, -torch.inf).cpu()
 
     latents = loc + scale * noise.to(loc)

@@ -148,7 +148,7 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
         gaussians[name] = Gaussian(loc=loc, scale=scale)
     source = (
         f"the network of the exact flow, seed {config.seed}, after "
-        f"{config.collector.total_frames:,} training steps"
+        f"{folder.load_settings()['collector']['total_frames']:,} training steps"
     )
     return KeptPolicy(source=source, gaussians=gaussians)
 

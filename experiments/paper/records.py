@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cnfp_torchrl.whole_file import whole_file
 
 RETURN, PROCESSOR, VIOLATIONS = "train/return", "train/processor_seconds", "violations/"
 """Names of curves; the last is followed by the constraint's."""
@@ -155,12 +156,9 @@ class Record(Kept):
             FileExistsError: when something stands there already.
         """
         path = record_path(folder, self.method, self.seed)
-        if path.exists():
-            raise FileExistsError(f"{path}: expected no file; move it away, or take another folder")
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}.partial")
-        partial.write_text(self.model_dump_json() + "\n")
-        partial.replace(path)
+        with whole_file(path, exclusive=True) as file:
+            file.write(f"{self.model_dump_json()}\n".encode())
         return path
 
     @model_validator(mode="after")

@@ -15,6 +15,7 @@ import os
 import platform
 import signal
 import subprocess
+from collections.abc import Mapping
 from contextlib import redirect_stderr
 from importlib.metadata import version
 from pathlib import Path
@@ -80,7 +81,9 @@ def do_run(
     """
     if method is None:
         raise ValueError("experiment: expected the name of a method, given null")
-    path, wanted = record_path(data, method, config.seed), settings(config)
+    content = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(content, dict)
+    path, wanted = record_path(data, method, config.seed), settings(content)
     if path.exists():
         if differing := _differing(Record.read(path).config, wanted):
             raise ValueError(
@@ -91,7 +94,7 @@ def do_run(
     attempts = sorted(folder.glob("attempt_*"))
     for attempt in attempts:
         run = RunFolder(attempt)
-        if (attempt / SUMMARY).is_file() and settings(run.load_config()) == wanted:
+        if (attempt / SUMMARY).is_file() and settings(run.load_settings()) == wanted:
             break
     else:
         run = RunFolder.create(folder / f"attempt_{1 + len(attempts)}")
@@ -113,7 +116,7 @@ def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
         method=method,
         seed=summary["seed"],
         overrides=tuple(overrides),
-        config=settings(folder.load_config()),
+        config=settings(folder.load_settings()),
         versions=versions(),
         commit=commit(),
         steps=summary["steps"],
@@ -131,12 +134,14 @@ def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
     )
 
 
-def settings(config: DictConfig) -> dict[str, Any]:
-    """Return what decides a run's result, resolved, as JSON would give it back."""
-    content = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(content, dict)
+def settings(config: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return what decides a run's result, as JSON would give it back.
+
+    Args:
+        config: plain data, with every interpolation resolved.
+    """
     return json.loads(
-        json.dumps({name: each for name, each in content.items() if name not in PRESENTATION})
+        json.dumps({name: each for name, each in config.items() if name not in PRESENTATION})
     )
 
 

@@ -28,8 +28,10 @@ def test_last_stage_is_the_flow(case: Case, dtype: torch.dtype) -> None:
     action, log_det = bijector.forward_and_log_det(z)
     assert stages.actions.shape == (stage_count(case), *z.shape)
     assert stages.log_dets.shape == (stage_count(case), *z.shape[:-1])
-    torch.testing.assert_close(stages.actions[-1], action, rtol=0, atol=0)
-    torch.testing.assert_close(stages.log_dets[-1], log_det, rtol=0, atol=0)
+    # The same arithmetic over tensors of other shapes, whose kernels may round differently.
+    eps = 64 * torch.finfo(dtype).eps * case.tightness
+    torch.testing.assert_close(stages.actions[-1], action, rtol=eps, atol=eps * case.size)
+    torch.testing.assert_close(stages.log_dets[-1], log_det, rtol=eps, atol=eps * case.dim)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.kind in RETRACTING], **ids)
@@ -42,8 +44,8 @@ def test_first_stage_is_the_squash_into_the_bounds(case: Case) -> None:
     torch.testing.assert_close(stages.actions[0], action.expand_as(stages.actions[0]))
     torch.testing.assert_close(stages.log_dets[0], log_det.expand_as(stages.log_dets[0]))
     again, reference_log_det = bijector.forward_and_reference_log_det(z)
-    torch.testing.assert_close(reference_log_det, stages.log_dets[0], rtol=0, atol=0)
-    torch.testing.assert_close(again, stages.actions[-1], rtol=0, atol=0)
+    torch.testing.assert_close(reference_log_det, stages.log_dets[0], rtol=1e-12, atol=1e-10)
+    torch.testing.assert_close(again, stages.actions[-1], rtol=1e-10, atol=1e-12 * case.size)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.kind == "radial"], **ids)
@@ -52,7 +54,7 @@ def test_reference_of_the_radial_squash_is_its_first_stage(case: Case) -> None:
     z = latents(case, 20, torch.float64)
     action, log_det = bijector.forward_and_reference_log_det(z)
     stages = bijector.stages(z)
-    torch.testing.assert_close(action, stages.actions[-1], rtol=0, atol=0)
+    torch.testing.assert_close(action, stages.actions[-1], rtol=1e-10, atol=1e-12 * case.size)
     torch.testing.assert_close(log_det, stages.log_dets[0], rtol=1e-12, atol=1e-10)
 
 

@@ -318,7 +318,8 @@ def test_in_a_replay_buffer_it_fills_in_what_was_not_stored() -> None:
         stored = rollout if here is sample else rollout["next"]
         index = (here["observation"].unsqueeze(1) == stored["observation"]).all(-1).int().argmax(1)
         for key in (("constraints", "anchor"), *(("constraints", n, "active") for n in ORDER)):
-            assert torch.equal(here[key], stored[key][index])
+            # Computed anew in a batch of another order and shape: up to rounding.
+            torch.testing.assert_close(here[key], stored[key][index])
 
 
 def test_transitions_without_a_next_state_are_fine() -> None:
@@ -326,7 +327,7 @@ def test_transitions_without_a_next_state_are_fine() -> None:
     state = env.reset()
     bare = state.exclude(("constraints", "anchor"))
     filled = env.transform[-1].clone()(bare)
-    assert torch.equal(filled["constraints", "anchor"], state["constraints", "anchor"])
+    torch.testing.assert_close(filled["constraints", "anchor"], state["constraints", "anchor"])
     assert "next" not in filled.keys()  # noqa: SIM118 - a tensordict iterates over its batch
 
 

@@ -431,7 +431,8 @@ def test_the_compiled_actor_is_one_graph_and_acts_alike(
         torch.manual_seed(1)
         expected = actor(state.clone())["action"]
         torch.manual_seed(1)
-        assert torch.equal(compiled(state.clone())["action"], expected)
+        # A compiler may fuse operations, which then round differently.
+        torch.testing.assert_close(compiled(state.clone())["action"], expected)
 
 
 # The action spec ----------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ def test_a_run_is_done_once_and_its_record_says_what_it_left(
     clock = record.curves["train/processor_seconds"]
     assert clock.steps[-1] == 192
     assert 0 < clock.values[0] <= clock.values[-1]
-    assert record.config == settings(config)
+    assert record.config == settings(RunFolder(attempt).load_settings())
     assert not {"figures", "logger", "visual", "hydra"} & set(record.config)
     assert {"python", "torch", "torchrl", "cnfp_torchrl"} <= set(record.versions)
 

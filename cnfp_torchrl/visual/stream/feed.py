@@ -23,7 +23,8 @@ from cnfp_torchrl.visual.stream.viewers import SinkError, Viewer, executable
 
 _log = logging.getLogger(__name__)
 
-_STARTUP_S = 2.5
+_STARTUP_S = 30.0
+"""A viewer that does not listen by then is given up; one that has ended is not waited for."""
 _SETTLED_S = 0.8
 """A window that cannot be opened has ended by then (0.3 s without a display)."""
 _POLL_S = 0.1

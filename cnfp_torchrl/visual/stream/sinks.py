@@ -96,7 +96,8 @@ def open_recording(
 
     Raises:
         FileExistsError: when there is a file already.
-        SinkError: when the file cannot be written or the viewer cannot be had; within 3 seconds.
+        SinkError: when the file cannot be written or the viewer cannot be had. A viewer that
+            neither listens nor ends is waited for, half a minute.
     """
     path = Path(path)
     if os.environ.get("RERUN", "on").lower() in ("0", "false", "off"):

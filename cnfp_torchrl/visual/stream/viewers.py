@@ -15,7 +15,8 @@ import rerun_cli
 
 LOOPBACK = "127.0.0.1"
 
-_PATIENCE_S = 1.0
+_PATIENCE_S = 5.0
+"""How long a viewer that listens may take to answer, on a machine that is busy with training."""
 _HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)
 """What opens every gRPC connection (RFC 9113, section 3.4), with empty settings."""
 _HTTP2_SETTINGS = 4

@@ -80,20 +80,24 @@ def test_any_batch_shape() -> None:
     position = torch.rand(2, 3, 2) * 2 - 1
     one = path.to_station(position[1, 2])
     for alone, among in zip(one, path.to_station(position), strict=True):
-        assert torch.equal(among[1, 2], alone)
+        torch.testing.assert_close(among[1, 2], alone)
     goals = path.to_goal(position, position.flip(0))
-    assert torch.equal(goals[1, 2], path.to_goal(position[1, 2], position[0, 2]))
+    torch.testing.assert_close(goals[1, 2], path.to_goal(position[1, 2], position[0, 2]))
 
 
 def test_visibility_is_what_the_indicator_sees() -> None:
-    """Two independent ways to decide it; random segments do not graze."""
+    """Two independent ways to decide it, which may differ by rounding where a segment grazes."""
     rectangles = torch.tensor(MAZE.rectangles)
     start, end = torch.rand(20_000, 2) * 2 - 1, torch.rand(20_000, 2) * 2 - 1
     end[:2000, 0] = start[:2000, 0]
     end[2000:4000, 1] = start[2000:4000, 1]
-    assert torch.equal(
-        visible(start, end, rectangles, 0.0), ~segment_touches_rectangle(start, end, rectangles)
+    outwards = 1e-6 * torch.tensor([-1.0, -1.0, 1.0, 1.0])
+    smaller, larger = (
+        segment_touches_rectangle(start, end, rectangles + sign * outwards) for sign in (-1, 1)
     )
+    clear = smaller == larger
+    assert clear.float().mean() > 0.999
+    assert torch.equal(visible(start, end, rectangles, 0.0)[clear], ~larger[clear])
 
 
 def test_the_clearance_must_exceed_the_margin() -> None:

@@ -1,0 +1,39 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextmanager
+def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
+    """Open a file that takes its name once everything is on the disk.
+
+    It is written under another name in the same folder. An error, a full disk and a power cut leave
+    what had the name before, or nothing.
+
+    Args:
+        path: the file's final name.
+        exclusive: refuse to take the place of another file, whoever made it in the meantime.
+
+    Raises:
+        FileExistsError: when exclusive and there is a file of this name.
+    """
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with partial.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if exclusive:
+            # Unlike renaming, linking never replaces: of two processes one succeeds.
+            os.link(partial, path)
+        else:
+            partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
