@@ -184,6 +184,5 @@ def _short(value: float) -> float:
 
 if __name__ == "__main__":
     # As Ctrl-C does, so that no run goes on when the sweep is stopped.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     main()
