@@ -8,9 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from cnfp_torchrl.visual.canvas import new_figure
-from cnfp_torchrl.visual.comparison import (
-    Estimate,
-    Look,
+from experiments.paper.labels import Label
+from experiments.paper.panels import (
     count_axis,
     draw_band,
     draw_estimates,
@@ -18,11 +17,12 @@ from cnfp_torchrl.visual.comparison import (
     spread_labels,
     step_axis,
 )
+from experiments.paper.statistics import Band, Interval
 
-LOOKS = [
-    Look("first", "#4B2E83", "D"),
-    Look("second", "#009E73", "o"),
-    Look("third", "#888888", "X"),
+LABELS = [
+    Label("first", "#4B2E83", "D"),
+    Label("second", "#009E73", "o"),
+    Label("third", "#888888", "X"),
 ]
 
 
@@ -30,13 +30,13 @@ def test_curves_that_coincide_can_be_told(draws: Callable[[Figure], bool]) -> No
     figure = new_figure(4, 3)
     axes = figure.add_subplot()
     x, zero = np.arange(30.0), np.zeros(30)
-    for place, look in enumerate(LOOKS):
-        draw_band(axes, look, x, zero, zero, zero, place=place, of=len(LOOKS))
+    for place, label in enumerate(LABELS):
+        draw_band(axes, label, Band(x, zero, zero, zero), place=place, of=len(LABELS))
     step_axis(axes)
     count_axis(axes.yaxis, 0)
-    legend_below(figure, LOOKS)
+    legend_below(figure, LABELS)
     marked = [line.get_markevery() for line in axes.lines if line.get_marker() in "DoX"]
-    assert len(marked) == len({start for start, _ in marked}) == len(LOOKS)
+    assert len(marked) == len({start for start, _ in marked}) == len(LABELS)
     assert draws(figure)
 
 
@@ -58,8 +58,8 @@ def test_count_axis_holds_zero_and_the_highest(name: str, highest: float, smalle
 def test_estimates_and_what_is_said_without_one(draws: Callable[[Figure], bool]) -> None:
     figure = new_figure(4, 3)
     axes = figure.add_subplot()
-    estimates = [Estimate(1.0, 0.8, 1.3), Estimate(2.0, None, None), None]
-    draw_estimates(axes, LOOKS, estimates, [[0.9, 1.1], [2.0], []], absent=["", "", "never"])
+    estimates = [Interval(1.0, 0.8, 1.3, 2), Interval(2.0, 2.0, 2.0, 1), None]
+    draw_estimates(axes, LABELS, estimates, [[0.9, 1.1], [2.0], []], absent=["", "", "never"])
     assert [label.get_text() for label in axes.get_yticklabels()] == ["first", "second", "third"]
     assert [text.get_text() for text in axes.texts] == ["never"]
     ends = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2]
@@ -71,7 +71,7 @@ def test_names_do_not_cover_each_other(draws: Callable[[Figure], bool]) -> None:
     figure = new_figure(5, 4)
     axes = figure.add_subplot()
     axes.set(xlim=(0, 1), ylim=(0, 1))
-    spread_labels(axes, [(0.1, 0.5, look) for look in LOOKS])
+    spread_labels(axes, [(0.1, 0.5, label) for label in LABELS])
     assert draws(figure)
     figure.draw_without_rendering()
     # Of the words alone: the extent of an annotation holds its line, too.

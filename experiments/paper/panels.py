@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,69 +10,33 @@ from matplotlib.axis import Axis, YAxis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FixedLocator, NullLocator, StrMethodFormatter
-from numpy.typing import NDArray
 
 from cnfp_torchrl.visual.colors import INK, MUTED
-
-Floats = NDArray[np.float64]
+from experiments.paper.labels import Label
+from experiments.paper.statistics import Band, Interval
 
 _MARKS = 6
 _NAME_SIZE = 9.0
 
 
-@dataclass(frozen=True)
-class Look:
-    """How a method appears in every figure.
-
-    Args:
-        label: its name for readers.
-        color: as ``#RRGGBB``.
-        marker: of matplotlib; tells methods apart where colors do not.
-    """
-
-    label: str
-    color: str
-    marker: str
-
-
-class Estimate(NamedTuple):
-    """A value and its interval; both ends None where one run gives none."""
-
-    value: float
-    low: float | None
-    high: float | None
-
-
-def draw_band(
-    axes: Axes,
-    look: Look,
-    x: Floats,
-    value: Floats,
-    low: Floats,
-    high: Floats,
-    *,
-    place: int,
-    of: int,
-) -> None:
-    """Draw a method's curve with the band between two others, arrays of one length.
+def draw_band(axes: Axes, label: Label, band: Band, *, place: int, of: int) -> None:
+    """Draw a method's curve and the band of its intervals.
 
     Args:
         axes: a panel.
-        look: of the method.
-        x: rising.
-        value: of the curve.
-        low: the band's lower edge.
-        high: the band's upper edge.
+        label: of the method.
+        band: what is drawn.
         place: of the method among those of the panel; the first lies above the others, and markers
             stand apart, so that curves that coincide, as at 0, can still be told.
         of: number of methods in the panel.
     """
-    every = max(of, len(x) // _MARKS)
-    layer = of - place
-    axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0, zorder=2 + layer)
-    axes.plot(x, value, color=look.color, linewidth=1.5, zorder=2 + layer)
+    x, every, layer = band.steps, max(of, len(band.steps) // _MARKS), of - place
+    axes.fill_between(
+        x, band.low, band.high, color=label.color, alpha=0.18, linewidth=0, zorder=2 + layer
+    )
+    axes.plot(x, band.value, color=label.color, linewidth=1.5, zorder=2 + layer)
     axes.plot(
-        x, value, look.marker, color=look.color, markersize=5,
+        x, band.value, label.marker, color=label.color, markersize=5,
         markevery=(every * place // of, every), markeredgecolor="white", markeredgewidth=0.6,
         zorder=2 + of + layer,
     )  # fmt: skip
@@ -82,8 +44,8 @@ def draw_band(
 
 def draw_estimates(
     axes: Axes,
-    looks: Sequence[Look],
-    estimates: Sequence[Estimate | None],
+    labels: Sequence[Label],
+    estimates: Sequence[Interval | None],
     runs: Sequence[Sequence[float]],
     *,
     absent: Sequence[str] = (),
@@ -92,14 +54,16 @@ def draw_estimates(
 
     Args:
         axes: an empty panel; the first method comes at the top.
-        looks: of the methods.
+        labels: of the methods.
         estimates: one for each, None where there is none.
         runs: the values behind each estimate.
         absent: what to say where there is no estimate, one for each.
     """
-    for row, (look, estimate, values) in enumerate(zip(looks, estimates, runs, strict=True)):
+    for row in range(1, len(labels), 2):
+        axes.axhspan(row - 0.5, row + 0.5, color="#F4F4F6", linewidth=0, zorder=0)
+    for row, (label, estimate, values) in enumerate(zip(labels, estimates, runs, strict=True)):
         axes.plot(
-            values, np.full(len(values), row + 0.22), "o", color=look.color, markersize=3,
+            values, np.full(len(values), row + 0.22), "o", color=label.color, markersize=3,
             alpha=0.45, markeredgewidth=0, zorder=2,
         )  # fmt: skip
         if estimate is None:
@@ -108,24 +72,17 @@ def draw_estimates(
                 transform=axes.get_yaxis_transform(), zorder=5,
             )  # fmt: skip
             continue
-        if estimate.low is not None and estimate.high is not None:
-            ends = (estimate.low, estimate.high)
-            axes.plot(ends, (row, row), color=look.color, linewidth=2.2, zorder=3)
+        ends = (estimate.low, estimate.high)
+        axes.plot(ends, (row, row), color=label.color, linewidth=2.2, zorder=3)
         axes.plot(
-            estimate.value, row, look.marker, color=look.color, markersize=7,
+            estimate.value, row, label.marker, color=label.color, markersize=7,
             markeredgecolor="white", markeredgewidth=0.8, zorder=4,
         )  # fmt: skip
-    axes.set_ylim(len(looks) - 0.4, -0.6)
-    axes.set_yticks(range(len(looks)), [look.label for look in looks])
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    axes.set_yticks(range(len(labels)), [label.name for label in labels])
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=True, axis="x")
     axes.spines[["top", "right", "left"]].set_visible(False)
-
-
-def draw_rows_apart(axes: Axes, count: int) -> None:
-    """Draw a faint stripe behind every other row of `draw_estimates`."""
-    for row in range(1, count, 2):
-        axes.axhspan(row - 0.5, row + 0.5, color="#F4F4F6", linewidth=0, zorder=0)
 
 
 def count_axis(axis: Axis, highest: float, *, smallest: float = 1.0) -> None:
@@ -160,18 +117,18 @@ def step_axis(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def legend_below(figure: Figure, looks: Sequence[Look], *, columns: int = 4) -> None:
+def legend_below(figure: Figure, labels: Sequence[Label], *, columns: int = 4) -> None:
     """Name the methods below all panels."""
     entries = [
-        Line2D([], [], color=look.color, marker=look.marker, markersize=6, linewidth=1.5,
-               markeredgecolor="white", markeredgewidth=0.6, label=look.label)
-        for look in looks
+        Line2D([], [], color=label.color, marker=label.marker, markersize=6, linewidth=1.5,
+               markeredgecolor="white", markeredgewidth=0.6, label=label.name)
+        for label in labels
     ]  # fmt: skip
     figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
 
 
 def spread_labels(
-    axes: Axes, points: Sequence[tuple[float, float, Look]], *, gap: float = 0.062
+    axes: Axes, points: Sequence[tuple[float, float, Label]], *, gap: float = 0.062
 ) -> None:
     """Write each method's name beside its point, none over another.
 
@@ -189,17 +146,17 @@ def spread_labels(
     # The marks themselves must stay readable too.
     taken: list[tuple[float, float, float]] = [(x - 0.015, x + 0.015, y) for x, y in places]
     for i in sorted(range(len(points)), key=lambda i: -places[i][1]):
-        (x, level), look = places[i], points[i][2]
+        (x, level), label = places[i], points[i][2]
         side = -1 if x > 0.6 else 1
-        near, far = sorted((x + 0.03 * side, x + (0.03 + letter * len(look.label)) * side))
+        near, far = sorted((x + 0.03 * side, x + (0.03 + letter * len(label.name)) * side))
         while any(
             abs(level - at) < gap and near < right and left < far for left, right, at in taken
         ):
             level -= gap / 8
         taken.append((near, far, level))
         axes.annotate(
-            look.label, tuple(places[i]), (x + 0.03 * side, level), xycoords="axes fraction",
-            ha="left" if side > 0 else "right", va="center", color=look.color,
+            label.name, tuple(places[i]), (x + 0.03 * side, level), xycoords="axes fraction",
+            ha="left" if side > 0 else "right", va="center", color=label.color,
             fontsize=_NAME_SIZE,
             arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.5, "shrinkB": 5,
                         "relpos": (0.0 if side > 0 else 1.0, 0.5)},

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from cnfp_torchrl.bijectors import BallSquash, BoxSquash, ShellSquash
 from cnfp_torchrl.geometry import Ball
-from cnfp_torchrl.visual.mappings import MappingExample, mappings
 from cnfp_torchrl.visual.outlines import set_outline
+from experiments.paper.figures_mappings import MappingExample, draw_mappings, mapping_examples
 
 ZERO, VIEW = torch.zeros(2, dtype=torch.float64), (-1.2, 1.2, -1.2, 1.2)
 RADIUS = torch.tensor(0.8, dtype=torch.float64)
@@ -30,7 +30,7 @@ def test_particles_land_in_the_set(draws: Callable[[Figure], bool]) -> None:
         MappingExample("box", box, (), first=box),
         MappingExample("shell", ShellSquash(ZERO, RADIUS / 4, RADIUS), set_outline(ball, VIEW)),
     ]
-    figure = mappings(examples, color="#E69F00", title="three")
+    figure = draw_mappings(examples)
     titles = [axes.get_title() for axes in figure.axes[:4]]
     assert titles == ["before: z ~ N(0, I)", "ball", "box", "shell"]
     before, *after = (axes.collections[-1].get_offsets() for axes in figure.axes[:4])
@@ -40,3 +40,11 @@ def test_particles_land_in_the_set(draws: Callable[[Figure], bool]) -> None:
     # The shell tears the lines through the origin; the others tear none.
     assert webs(figure, 0) == webs(figure, 1) == webs(figure, 2) < webs(figure, 3)
     assert draws(figure)
+
+
+def test_each_family_is_drawn_once() -> None:
+    titles = [example.title for example in mapping_examples()]
+    assert titles[:4] == [
+        "box squash", "ball squash", "ellipsoid squash", "retraction of the bounds",
+    ]  # fmt: skip
+    assert len(titles) == len(set(titles)) == 9

@@ -1,55 +1,62 @@
 """Verdicts follow the data: each rule, with records on either side of it."""
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import pytest
 
-from experiments.paper import statistics
-from experiments.paper.comparisons import as_fast, at_least, faster, higher, on_par
-from experiments.paper.records import PROCESSOR, RETURN, SECONDS, VIOLATIONS, Record, Series
-from experiments.paper.verdicts import (
+from experiments.paper.claims import (
+    QUASI,
+    Claim,
+    Evidence,
     Finding,
     Verdict,
+    as_fast,
+    at_least,
+    beats_with_similar_violations,
     falls,
-    near_satisfaction,
+    faster,
+    higher,
+    on_par,
     satisfaction,
+    score,
     violate_at_first,
 )
-from tests.paper.synthetic import CONSTRAINTS, make_outcome, make_record
+from experiments.paper.records import PROCESSOR, RETURN, VIOLATIONS, Evaluation, Record, Series
+from tests.paper.synthetic import (
+    CONSTRAINTS,
+    changed,
+    make_evaluation,
+    make_outcome,
+    make_record,
+)
 
 YES, PARTLY, NO, UNTESTED = Verdict
 STEPS, GRID = 20_000, tuple(range(500, 20_001, 500))
 
 
-@pytest.fixture(autouse=True)
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(statistics, "RESAMPLES", 300)
+pytestmark = pytest.mark.usefixtures("coarse")
+
+
+def judged(by: Callable[[], Finding]) -> Verdict:
+    """Return the verdict of a claim that is judged so; `Verdict.UNTESTED` where it cannot be."""
+    return Claim("", "", lambda evidence, flow: by()).judge(Evidence({}, {})).verdict
 
 
 def scored(*scores: float) -> list[Record]:
     """Return runs with these scores."""
     return [
-        dataclasses.replace(
-            make_record(seed=seed),
-            evaluation=dict.fromkeys(("stochastic", "deterministic"), make_outcome(score)),
-        )
-        for seed, score in enumerate(scores)
+        changed(make_record(seed=seed), evaluation=make_evaluation(each))
+        for seed, each in enumerate(scores)
     ]
-
-
-def score(run: Record) -> float:
-    return run.evaluation["stochastic"].score
 
 
 def violating(training: int, evaluation: int) -> list[Record]:
     """Return a clean run, and one with violating steps, of 20,000 + 2 x 40,000 each."""
-    outcome = make_outcome(violations=0)
-    broken = dataclasses.replace(outcome, violations={"obstacle": evaluation, "battery": 0})
-    run = dataclasses.replace(
+    broken = changed(make_outcome(), violations={"obstacle": evaluation, "battery": 0})
+    run = changed(
         make_record(seed=1),
         training_violations={"obstacle": training, "battery": 0},
-        evaluation={"stochastic": outcome, "deterministic": broken},
+        evaluation=Evaluation(stochastic=make_outcome(), deterministic=broken),
     )
     return [make_record(seed=0), run]
 
@@ -59,10 +66,10 @@ def reaching(*steps: int | None) -> list[Record]:
     runs = []
     for seed, step in enumerate(steps):
         returns = [14.0 if step is not None and at >= step else -104.0 for at in GRID]
-        time = Series(GRID, tuple(at / 100 for at in GRID))
-        curves = {RETURN: Series(GRID, tuple(returns)), SECONDS: time, PROCESSOR: time}
+        time = Series(steps=GRID, values=tuple(at / 100 for at in GRID))
+        curves = {RETURN: Series(steps=GRID, values=tuple(returns)), PROCESSOR: time}
         run = make_record(seed=seed)
-        runs.append(dataclasses.replace(run, curves={**run.curves, **curves}))
+        runs.append(changed(run, curves={**run.curves, **curves}))
     return runs
 
 
@@ -71,11 +78,10 @@ def falling(*rates: tuple[float, float]) -> list[Record]:
     runs = []
     for seed, (first, second) in enumerate(rates):
         counts = [5 * (first * min(i, 20) + second * max(i - 20, 0)) for i in range(1, 41)]
-        none = Series(GRID, (0.0,) * len(GRID))
-        curves = {VIOLATIONS + CONSTRAINTS[0]: Series(GRID, tuple(counts))}
         run = make_record(seed=seed)
-        every = {**run.curves, VIOLATIONS + CONSTRAINTS[1]: none, **curves}
-        runs.append(dataclasses.replace(run, curves=every))
+        both = zip(CONSTRAINTS, (counts, [0.0] * len(GRID)), strict=True)
+        curves = {VIOLATIONS + name: Series(steps=GRID, values=tuple(v)) for name, v in both}
+        runs.append(changed(run, curves={**run.curves, **curves}))
     return runs
 
 
@@ -89,12 +95,11 @@ def falling(*rates: tuple[float, float]) -> list[Record]:
         (violating(60, 41), NO, PARTLY),
         (violating(600, 400), NO, PARTLY),
         (violating(600, 401), NO, NO),
-        ([], UNTESTED, UNTESTED),
     ],
 )
 def test_satisfaction(runs: list[Record], perfect: Verdict, near: Verdict) -> None:
     assert satisfaction(runs).verdict is perfect
-    assert near_satisfaction(runs).verdict is near
+    assert satisfaction(runs, QUASI, 10 * QUASI).verdict is near
 
 
 LOW, MIDDLE, HIGH = (0.5, 0.51, 0.52), (0.7, 0.9, 1.1), (1.0, 1.01, 1.02)
@@ -114,7 +119,6 @@ LOW, MIDDLE, HIGH = (0.5, 0.51, 0.52), (0.7, 0.9, 1.1), (1.0, 1.01, 1.02)
         (HIGH, [(0.5,)], UNTESTED, UNTESTED),
         (HIGH, [LOW, ()], UNTESTED, UNTESTED),
         ((), [LOW], UNTESTED, UNTESTED),
-        (HIGH, [], UNTESTED, UNTESTED),
     ],
 )
 def test_comparison_with_others(
@@ -124,8 +128,8 @@ def test_comparison_with_others(
     is_at_least: Verdict,
 ) -> None:
     named: dict[str, Sequence[Record]] = {f"{i}": scored(*each) for i, each in enumerate(others)}
-    assert higher(scored(*mine), named, score).verdict is is_higher
-    assert at_least(scored(*mine), named, score).verdict is is_at_least
+    assert judged(lambda: higher(scored(*mine), named, score)) is is_higher
+    assert judged(lambda: at_least(scored(*mine), named, score)) is is_at_least
 
 
 @pytest.mark.parametrize(
@@ -139,7 +143,7 @@ def test_comparison_with_others(
     ],
 )
 def test_on_par(mine: Sequence[float], other: Sequence[float], verdict: Verdict) -> None:
-    assert on_par(scored(*mine), scored(*other), score).verdict is verdict
+    assert judged(lambda: on_par(scored(*mine), scored(*other), score)) is verdict
 
 
 @pytest.mark.parametrize(
@@ -161,8 +165,8 @@ def test_speed(
     as_fast_as: Verdict,
     faster_than: Verdict,
 ) -> None:
-    assert as_fast(reaching(*mine), reaching(*other)).verdict is as_fast_as
-    assert faster(reaching(*mine), {"other": reaching(*other)}).verdict is faster_than
+    assert judged(lambda: as_fast(reaching(*mine), reaching(*other))) is as_fast_as
+    assert judged(lambda: faster(reaching(*mine), {"other": reaching(*other)})) is faster_than
 
 
 @pytest.mark.parametrize(
@@ -175,8 +179,6 @@ def test_speed(
         ([[(20, 1)], [(20, 11)]], NO),
         ([[(1, 5)]], NO),
         ([[(0, 0)]], NO),
-        ([[(20, 1)], []], UNTESTED),
-        ([], UNTESTED),
     ],
 )
 def test_fall_of_violations(methods: list[list[tuple[float, float]]], verdict: Verdict) -> None:
@@ -185,14 +187,38 @@ def test_fall_of_violations(methods: list[list[tuple[float, float]]], verdict: V
 
 @pytest.mark.parametrize(
     ("rates", "verdict"),
-    [([(1, 0), (5, 0)], YES), ([(0.9, 0), (5, 0)], PARTLY), ([(0.9, 9)], NO), ([], UNTESTED)],
+    [([(1, 0), (5, 0)], YES), ([(0.9, 0), (5, 0)], PARTLY), ([(0.9, 9)], NO)],
 )
 def test_violations_at_first(rates: list[tuple[float, float]], verdict: Verdict) -> None:
     assert violate_at_first({"method": falling(*rates)}).verdict is verdict
 
 
+@pytest.mark.parametrize(
+    ("mine", "end", "verdict"),
+    [(HIGH, 2, YES), (HIGH, 9, PARTLY), (LOW, 2, NO), ((), 2, UNTESTED)],
+)
+def test_a_higher_score_with_similar_violations(
+    mine: Sequence[float], end: float, verdict: Verdict
+) -> None:
+    def with_end(runs: list[Record], *ends: float) -> list[Record]:
+        curves = falling(*((20, each) for each in ends))
+        return [changed(run, curves=each.curves) for run, each in zip(runs, curves, strict=True)]
+
+    other = with_end(scored(0.6, 0.61, 0.62), 1, 2, 3)
+    runs = with_end(scored(*mine), *(end + i for i in range(len(mine))))
+    found = judged(lambda: beats_with_similar_violations(runs, other, "other"))
+    assert found is verdict
+
+
+def test_methods_without_runs_are_named() -> None:
+    evidence = Evidence({"exact": scored(1.0)}, {})
+    claim = Claim("", "", lambda e, flow: higher(e.one(flow), e.of("penalty"), score))
+    assert claim.judge(evidence) == Finding(UNTESTED, "no runs of reward penalty")
+    assert claim.judge(evidence, "squash").verdict is UNTESTED
+
+
 def test_numbers_are_said() -> None:
-    found: Finding = satisfaction(violating(3, 4))
+    found = satisfaction(violating(3, 4))
     assert found.measured.startswith("7 violating of 200,000 steps in 2 runs")
     found = at_least(scored(*HIGH), {"low": scored(*LOW)}, score)
     assert found.measured.startswith("0.50 [")
