@@ -14,7 +14,7 @@ NUMERIC := $(filter-out %/test_compile.py,$(wildcard tests/bijectors/test_*.py t
 	tests/test_distributions.py tests/modules/test_latent.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench paper figures check lint types format clean
+.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench paper figures check lint rooms types format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,11 +63,14 @@ view: $(STAMP) ## Open the newest recording in a Rerun viewer (ARGS="--web" for 
 explain: $(STAMP) ## Say in words what a policy did (ARGS="RUN --step N")
 	$(PY) experiments/explain.py $(ARGS)
 
-check: lint types ## Check format, lint and types
+check: lint rooms types ## Check format, lint, imports between rooms, and types
 
 lint: $(STAMP)
 	$(PY) -m ruff format --check
 	$(PY) -m ruff check
+
+rooms: $(STAMP)
+	$(VENV)/bin/lint-imports
 
 types: $(STAMP)
 	$(PY) -m mypy
@@ -77,7 +80,7 @@ format: $(STAMP) ## Format the code and mend what the linter can
 	$(PY) -m ruff check --fix
 
 clean: ## Remove caches and build products (never .venv or outputs)
-	rm -rf build dist .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build dist .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find cnfp_torchrl experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The constraints go through the environment because that also pins the isolated builds that pip

@@ -199,8 +199,8 @@ def build(
     network = HostileNetwork(hostile)
     actor = make_constrained_actor(
         network,
-        env.action_spec_unbatched,
-        constraint_bijectors(env),
+        bijectors=constraint_bijectors(env),
+        spec=env.action_spec_unbatched,
         order=list(config.flow.order),
         flow=instantiate(config.flow.combine),
     )

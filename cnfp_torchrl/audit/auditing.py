@@ -33,8 +33,7 @@ from cnfp_torchrl.audit.states import (
     uniform_states,
 )
 from cnfp_torchrl.audit.trial import run_trial
-from cnfp_torchrl.envs import constraint_bijectors
-from cnfp_torchrl.envs.cost import Indicator
+from cnfp_torchrl.envs import Indicator, constraint_bijectors
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     ConstraintBijector,

@@ -14,8 +14,8 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from cnfp_torchrl.audit.states import Place, bare, difference
-from cnfp_torchrl.envs import constraint_names
-from cnfp_torchrl.envs.cost import COST_KEY, Indicator
+from cnfp_torchrl.envs import Indicator, constraint_names
+from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cnfp_torchrl.envs.cost import COST_KEY
+from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.tasks.point_nav.geometry import read_observation
 

@@ -1,21 +1,23 @@
 """Transforms that publish an environment's constraints into the tensordict."""
 
 from cnfp_torchrl.envs.action_guard import ActionGuard
-from cnfp_torchrl.envs.anchor_transform import (
-    ConstraintAnchor,
-    constrain_env,
-    constraint_bijectors,
-)
-from cnfp_torchrl.envs.cost import ConstraintCost, constraint_names
+from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.constrain_env import constrain_env
+from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.penalty import RewardPenalty
+
+# Whoever has an environment in hand looks for these here.
+from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
 __all__ = [
     "ActionGuard",
     "ConstraintAnchor",
     "ConstraintCost",
     "GeometryTransform",
+    "Indicator",
     "RewardPenalty",
+    "appended_transforms",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",

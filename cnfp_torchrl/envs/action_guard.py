@@ -9,11 +9,14 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor, constraint_bijectors
-from cnfp_torchrl.envs.geometry_transform import appended_transforms
-from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY, require
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
-from cnfp_torchrl.modules.guard import refuse_violations
+from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.keys import ANCHOR_KEY, require
+from cnfp_torchrl.modules import (
+    ConstrainedFlowModule,
+    appended_transforms,
+    constraint_bijectors,
+    refuse_violations,
+)
 
 
 class ActionGuard(Transform):

@@ -3,107 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.geometry_transform import (
-    SAFE_ACTION_KEY,
-    GeometryTransform,
-    appended_transforms,
+from cnfp_torchrl.geometry import Box, GeometryError, lexicographic_anchor
+from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
+from cnfp_torchrl.modules import (
+    ActionBounds,
+    ConstraintBijector,
+    ConstraintPublisher,
+    action_bounds,
+    in_order,
 )
-from cnfp_torchrl.geometry import Box, GeometryError
-from cnfp_torchrl.geometry.anchors import lexicographic_anchor
-from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY, ConstraintBijector, in_order
-from cnfp_torchrl.modules.flow_module import action_bounds
-
-_EXAMPLE = "write constrain_env(env, BatteryGeometry(), ObstacleGeometry())"
 
 
-def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
-    """Return a bijector for each constraint that the environment publishes.
-
-    They come in order of application: that of the environment's `ConstraintAnchor`, or without one
-    that of its geometry transforms.
-
-    Args:
-        env: such as `constrain_env` returns; one environment, no batch of environments in workers.
-
-    Raises:
-        ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out.
-    """
-    anchors = [each for each in appended_transforms(env) if isinstance(each, ConstraintAnchor)]
-    bijectors = anchors[-1].bijectors if anchors else _published(env)
-    if not bijectors:
-        raise ValueError(
-            f"env: expected one that publishes at least one constraint, given "
-            f"{type(env).__name__} without a GeometryTransform of its own; make it with "
-            "constrain_env, and before batching: the transforms in the workers of a SerialEnv or "
-            "ParallelEnv are out of reach, so call this on one of the environments it is made of"
-        )
-    known = {bijector.name for bijector in bijectors}
-    if left_out := [each.name for each in _geometries(env) if each.name not in known]:
-        raise ValueError(
-            f"env: expected its ConstraintAnchor to know all constraints, given one with "
-            f"{sorted(known)} that leaves out {left_out}; pass all geometries to one constrain_env"
-        )
-    return bijectors
-
-
-def constrain_env(
-    env: EnvBase, *geometries: GeometryTransform, order: Sequence[str] | None = None
-) -> TransformedEnv:
-    """Let an environment publish what each state allows: geometries, anchor and active flags.
-
-    The counterpart of `cnfp_torchrl.modules.constrain`, which makes an actor heed them; its
-    bijectors are ``constraint_bijectors(env)``.
-
-    Args:
-        env: with a bounded action spec; not changed.
-        geometries: one transform for each constraint.
-        order: the constraints' names in order of application, the last with the highest priority;
-            None takes the order of the geometries. ``constraint_bijectors(env)`` keeps it.
-
-    Raises:
-        TypeError: when the environment or a geometry is none, such as a class or a list, or when
-            the order is a string.
-        ValueError: without geometries, or when an order does not name each constraint once.
-    """
-    if not isinstance(env, EnvBase):
-        raise TypeError(
-            f"env: expected a TorchRL environment, given {_kind(env)}; wrap one of Gymnasium's in "
-            "torchrl.envs.GymWrapper"
-        )
-    if not geometries:
-        raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
-    for each in geometries:
-        if not isinstance(each, GeometryTransform):
-            raise TypeError(
-                f"geometries: expected each to be a GeometryTransform, given {_kind(each)}; "
-                f"{_EXAMPLE}"
-            )
-    published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
-    return published.append_transform(ConstraintAnchor(_published(published), order))
-
-
-def _kind(given: object) -> str:
-    return f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
-
-
-def _published(env: EnvBase) -> list[ConstraintBijector]:
-    geometries = _geometries(env)
-    state = env.observation_spec.zero() if geometries else None
-    return [ConstraintBijector(each.name, type(each.checked_set(state))) for each in geometries]
-
-
-def _geometries(env: EnvBase) -> list[GeometryTransform]:
-    return [each for each in appended_transforms(env) if isinstance(each, GeometryTransform)]
-
-
-class ConstraintAnchor(Transform):
+class ConstraintAnchor(Transform, ConstraintPublisher):
     """Publish the anchor of the allowed region and which constraints hold, for exact flows.
 
     Reads the sets that the geometry transforms before it publish, and a candidate at
@@ -125,17 +43,15 @@ class ConstraintAnchor(Transform):
         ValueError: when an order does not name each constraint exactly once.
     """
 
-    _low: Tensor | None
-    _high: Tensor | None
+    states_order = True
 
     def __init__(
         self, bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None = None
     ) -> None:
         super().__init__()
         self._bijectors = in_order(bijectors, order)
-        # Of the action bounds, read from the parent once; buffers, to move with the environment.
-        self.register_buffer("_low", None, persistent=False)
-        self.register_buffer("_high", None, persistent=False)
+        # Read from the parent once; a module, to move with the environment.
+        self._bounds: ActionBounds | None = None
 
     @property
     def bijectors(self) -> list[ConstraintBijector]:
@@ -187,8 +103,14 @@ class ConstraintAnchor(Transform):
             )
         return observation_spec
 
-    def _action_bounds(self) -> Box:
-        if self._low is None or self._high is None:
+    def clone(self) -> Self:
+        """Return a copy without environment, which keeps the action bounds of this one's."""
+        if self.parent is not None:
+            self._action_bounds()
+        return super().clone()
+
+    def _action_bounds(self, device: torch.device | None = None) -> Box:
+        if self._bounds is None:
             if self.parent is None:
                 raise RuntimeError(
                     "ConstraintAnchor: expected to be part of an environment, which knows the "
@@ -196,5 +118,5 @@ class ConstraintAnchor(Transform):
                     "this)), and to a replay buffer a clone() of an environment's own"
                 )
             bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
-            self._low, self._high = bounds.low, bounds.high
-        return Box(self._low, self._high, validate_args=False)
+            self._bounds = ActionBounds(bounds)
+        return self._bounds.on(device)

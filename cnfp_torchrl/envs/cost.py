@@ -11,13 +11,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from cnfp_torchrl.envs.geometry_transform import appended_transforms
+from cnfp_torchrl.keys import COST_KEY, EPISODE_COST_KEY
+from cnfp_torchrl.modules import appended_transforms
 
 Indicator = Callable[[TensorDictBase, TensorDictBase], Tensor]
 """``(state and action, what the step led to) -> violated?``, bool ``(*batch,)``."""
-
-COST_KEY = "cost"
-EPISODE_COST_KEY = "episode_cost"
 
 
 class ConstraintCost(Transform):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -10,21 +10,20 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Transform
 
 from cnfp_torchrl.geometry import ConstraintSet, GeometryError
-from cnfp_torchrl.modules.constraint_bijector import refuse_string
+from cnfp_torchrl.keys import (
+    CONSTRAINTS_KEY,
+    RESERVED_NAMES,
+    SAFE_ACTION_KEY,
+    field_key,
+    refuse_string,
+)
+from cnfp_torchrl.modules import ConstraintBijector, ConstraintPublisher
 
-CONSTRAINTS_KEY = "constraints"
-"""Where geometry stands in the tensordict: ``("constraints", NAME, FIELD)``."""
 
-SAFE_ACTION_KEY = (CONSTRAINTS_KEY, "safe_action")
-"""A candidate for the anchor: an action that a geometry believes to be safe, ``(*batch, d)``."""
-
-_RESERVED_NAMES = ("anchor", "safe_action")
-
-
-class GeometryTransform(Transform, ABC):
+class GeometryTransform(Transform, ConstraintPublisher):
     """Publishes one constraint's set of allowed actions, as a function of the state.
 
     A new constraint is one method::
@@ -60,9 +59,9 @@ class GeometryTransform(Transform, ABC):
     _family: type[ConstraintSet] | None = None
 
     def __init__(self, name: str, in_keys: Sequence[NestedKey] = ("observation",)) -> None:
-        if not isinstance(name, str) or not name or name in _RESERVED_NAMES:
+        if not isinstance(name, str) or not name or name in RESERVED_NAMES:
             raise ValueError(
-                f"name: expected a constraint's name other than {list(_RESERVED_NAMES)}, "
+                f"name: expected a constraint's name other than {list(RESERVED_NAMES)}, "
                 f"given {name!r}"
             )
         refuse_string("in_keys", in_keys)
@@ -93,6 +92,16 @@ class GeometryTransform(Transform, ABC):
             allowed: what `constraint_set` returned for it.
         """
         return None
+
+    @property
+    def bijectors(self) -> list[ConstraintBijector]:
+        """The constraint's own, alone."""
+        if self._family is None:
+            raise RuntimeError(
+                f"constraint '{self.name}': expected to be part of an environment whose specs were "
+                "read, which tells the family of its sets; use constraint_bijectors(env)"
+            )
+        return [ConstraintBijector(self.name, self._family)]
 
     def checked_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return `constraint_set` of some states, if it is a set of the same family as before.
@@ -164,7 +173,7 @@ class GeometryTransform(Transform, ABC):
                     f"constraint '{self.name}', field '{field}': expected a batch shape that "
                     f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
                 ) from None
-            entries[CONSTRAINTS_KEY, self.name, field] = expanded
+            entries[field_key(self.name, field)] = expanded
         with self._naming_the_constraint("safe_action"):
             action = self.safe_action(tensordict, allowed)
         if action is not None:
@@ -225,19 +234,3 @@ def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> N
     if not isinstance(given, Tensor) or given.shape != torch.Size(shape):
         what = tuple(given.shape) if isinstance(given, Tensor) else type(given).__name__
         raise GeometryError(f"{expected} a tensor of shape {tuple(shape)}, given {what}")
-
-
-def appended_transforms(env: EnvBase) -> list[Transform]:
-    """Return the transforms of an environment in order, none if it has none.
-
-    Those in the workers of a batched environment are not among them.
-    """
-    if not isinstance(env, TransformedEnv):
-        return []
-    return [*appended_transforms(env.base_env), *_flat(env.transform)]
-
-
-def _flat(transform: Transform) -> list[Transform]:
-    if not isinstance(transform, Compose):
-        return [transform]
-    return [part for each in transform for part in _flat(each)]

@@ -9,11 +9,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.cost import COST_KEY
-
-REWARD_KEY = "reward"
-RAW_REWARD_KEY = "raw_reward"
-"""Where `RewardPenalty` keeps the environment's own reward."""
+from cnfp_torchrl.keys import COST_KEY, RAW_REWARD_KEY, REWARD_KEY
 
 
 class RewardPenalty(Transform):

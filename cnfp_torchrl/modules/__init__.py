@@ -1,5 +1,7 @@
 """TensorDictModules that give actors hard action constraints."""
 
+from cnfp_torchrl.keys import MissingGeometryError
+from cnfp_torchrl.modules.action_bounds import ActionBounds, action_bounds, refuse_other_bounds
 from cnfp_torchrl.modules.actors import (
     constrain,
     flow_head,
@@ -7,7 +9,7 @@ from cnfp_torchrl.modules.actors import (
     make_constrained_actor,
     with_reference_entropy,
 )
-from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, MissingGeometryError
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.flows import (
     ExactFlow,
@@ -18,13 +20,25 @@ from cnfp_torchrl.modules.flows import (
     SquashFlow,
     UnconstrainedFlow,
 )
-from cnfp_torchrl.modules.guard import ConstraintViolationError, ExecutedActionGuard, guarded
+from cnfp_torchrl.modules.guard import (
+    ConstraintViolationError,
+    ExecutedActionGuard,
+    guarded,
+    refuse_violations,
+)
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.publisher import (
+    ConstraintPublisher,
+    appended_transforms,
+    constraint_bijectors,
+)
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
+    "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
     "ExecutedActionGuard",
@@ -39,11 +53,17 @@ __all__ = [
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",
+    "action_bounds",
+    "appended_transforms",
     "constrain",
+    "constraint_bijectors",
     "flow_head",
     "guarded",
     "has_density",
+    "in_order",
     "make_constrained_actor",
+    "refuse_other_bounds",
+    "refuse_violations",
     "split_at_latent",
     "with_reference_entropy",
 ]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase
 from torchrl.modules import (
     IndependentNormal,
     SafeProbabilisticTensorDictSequential,
@@ -17,100 +18,139 @@ from torchrl.modules import (
 )
 
 from cnfp_torchrl.geometry import Box
-from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, refuse_string
-from cnfp_torchrl.modules.flow_module import (
-    ConstrainedFlowModule,
-    ReferenceEntropyFlowModule,
-    action_bounds,
-)
+from cnfp_torchrl.keys import ACTION_KEY, LOC_KEY, SCALE_KEY, refuse_string
+from cnfp_torchrl.modules.action_bounds import action_bounds, refuse_other_bounds
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, ReferenceEntropyFlowModule
 from cnfp_torchrl.modules.flows import Flow
+from cnfp_torchrl.modules.publisher import constraint_bijectors
 
 
 def make_constrained_actor(
     network: nn.Module,
-    spec: TensorSpec,
-    bijectors: Sequence[ConstraintBijector],
+    env: EnvBase | None = None,
     *,
-    in_keys: Sequence[NestedKey] = ("observation",),
+    bijectors: Sequence[ConstraintBijector] | None = None,
+    spec: TensorSpec | None = None,
     order: Sequence[str] | None = None,
     flow: Flow | str = "exact",
+    in_keys: Sequence[NestedKey] = ("observation",),
     return_log_prob: bool = False,
 ) -> SafeProbabilisticTensorDictSequential:
     """Return an actor whose every action satisfies the constraints.
 
+    Constraints, their priority and the action bounds are those of the environment. Where there is
+    none, give `bijectors` and `spec` in its place.
+
     Args:
-        network: maps the observations to location and scale of a Gaussian, two tensors
+        network: A map from observations to location and scale of a Gaussian, two tensors
             ``(*batch, d)``; `torchrl.modules.NormalParamExtractor` ends such a network.
-        spec: the bounded action spec, such as ``env.action_spec_unbatched``.
-        bijectors: one for each constraint.
-        in_keys: what the network reads.
-        order: see `ConstrainedFlowModule`.
-        flow: see `ConstrainedFlowModule`.
-        return_log_prob: also write ``action_log_prob``.
+        env: An environment of `constrain_env`.
+        bijectors: One for each constraint in order of application, the last with the highest
+            priority; without `env`.
+        spec: The bounded action spec of one state, ``(d,)``; without `env`.
+        order: The constraints' names in order of application: another order than that of
+            `bijectors`, or a check of the environment's, which is set in `constrain_env`.
+        flow: The way to combine the sets, see `ConstrainedFlowModule`.
+        in_keys: The keys of what the network reads.
+        return_log_prob: Whether to write the action's log-density, too.
 
     Raises:
-        TypeError: when `in_keys` or `order` is a string, or a bijector is none.
-        ValueError: see `ConstrainedFlowModule`.
+        TypeError: when `env` is no environment, a sequence of names is a string, or a bijector is
+            none.
+        ValueError: when both or neither of `env` and `bijectors` with `spec` are given, when two
+            statements differ, or see `ConstrainedFlowModule`.
     """
     refuse_string("in_keys", in_keys)
-    parameters = TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"])
+    statement = _stated(env, bijectors, spec, order)
+    if statement.bijectors is None or statement.spec is None:
+        missing = "bijectors" if statement.bijectors is None else "spec"
+        raise ValueError(
+            f"{missing}: expected an environment, or both bijectors and spec, given neither "
+            f"environment nor {missing}; write make_constrained_actor(network, env)"
+        )
+    parameters = TensorDictModule(network, in_keys=list(in_keys), out_keys=[LOC_KEY, SCALE_KEY])
     head = ConstrainedFlowModule(
-        spec, bijectors, order=order, flow=flow, return_log_prob=return_log_prob
+        statement.spec,
+        statement.bijectors,
+        order=order,
+        flow=flow,
+        out_key=ACTION_KEY if env is None else env.action_key,
+        return_log_prob=return_log_prob,
     )
     return SafeProbabilisticTensorDictSequential(parameters, head)
 
 
 def constrain(
     actor: ProbabilisticTensorDictSequential,
-    *bijectors: ConstraintBijector,
-    flow: Flow | str = "exact",
-    order: Sequence[str] | None = None,
+    env: EnvBase | None = None,
+    *,
+    bijectors: Sequence[ConstraintBijector] | None = None,
     spec: TensorSpec | None = None,
+    order: Sequence[str] | None = None,
+    flow: Flow | str = "exact",
 ) -> SafeProbabilisticTensorDictSequential:
     """Return the actor with constraints appended; its networks are shared, not copied.
+
+    Constraints, their priority and the action bounds are those of the environment. Where there is
+    none, give `bijectors` in its place, and `spec` unless the actor has one.
 
     The actor's last module must draw from a `TanhNormal` or an `IndependentNormal`: its Gaussian
     parameters become the base of the flow, so that a tanh is not applied twice. Keys, log-prob and
     default interaction type stay as they are. An actor that is constrained already keeps its
-    constraints: the new ones are applied after them, with higher priority, unless `order` says
-    otherwise, and `flow` takes the place of its flow.
+    constraints: further bijectors are applied after them, with higher priority, and `flow` takes
+    the place of its flow.
 
     Args:
-        actor: a `torchrl.modules.ProbabilisticActor` or another sequence that ends in a
+        actor: A `torchrl.modules.ProbabilisticActor` or another sequence that ends in a
             probabilistic module.
-        bijectors: one for each constraint, in order of application unless `order` is given; none
-            only where the actor is constrained already, to change its flow or order.
-        flow: see `ConstrainedFlowModule`.
-        order: see `ConstrainedFlowModule`.
-        spec: the bounded action spec; None takes the actor's own.
+        env: An environment of `constrain_env`.
+        bijectors: One for each constraint in order of application, the last with the highest
+            priority; without `env`. None only where the actor is constrained already.
+        spec: The bounded action spec of one state, ``(d,)``; without `env`. None takes the actor's
+            own.
+        order: The constraints' names in order of application: another order than that of
+            `bijectors`, or a check of the environment's, which is set in `constrain_env`.
+        flow: The way to combine the sets, see `ConstrainedFlowModule`.
 
     Raises:
-        TypeError: when the actor does not end in a distribution that can be a base, when a bijector
-            is none, or when the order is a string.
-        ValueError: when bounds are missing or are not those of the TanhNormal, when the
-            distribution is more than a Gaussian of location and scale, when an order does not
-            name each constraint once, or when there would be no constraint.
+        TypeError: when the actor does not end in a distribution that can be a base, when `env` is
+            no environment, a bijector is none, or the order is a string.
+        ValueError: when bounds are missing or are not those of the TanhNormal, when two statements
+            differ, when the distribution is more than a Gaussian of location and scale, when an
+            order does not name each constraint once, or when there would be no constraint.
     """
     *body, head = actor_modules(actor)
     parameter_keys = _parameter_keys(head)
     action_key = head.dist_sample_keys[0]
-    spec = getattr(head, "spec", None) if spec is None else spec
-    if spec is None or (isinstance(spec, Composite) and spec[action_key] is None):
+    own_spec = _own_spec(head, action_key)
+    statement = _stated(env, bijectors, spec, order)
+    if (spec := own_spec if statement.spec is None else statement.spec) is None:
         raise ValueError(
             "spec: expected the bounded action spec, but the actor has none; pass "
-            "constrain(..., spec=env.action_spec_unbatched)"
+            "constrain(actor, env), or constrain(..., spec=SPEC) without an environment"
         )
-    _refuse_other_bounds(head, action_bounds(spec, action_key))
-    is_constrained = isinstance(head, ConstrainedFlowModule)
-    if not bijectors and not is_constrained:
+    bounds = action_bounds(spec, action_key)
+    if own_spec is not None:
+        refuse_other_bounds("actor", action_bounds(own_spec, action_key), bounds)
+    _refuse_other_tanh_bounds(head, bounds)
+    before = head.bijectors if isinstance(head, ConstrainedFlowModule) else []
+    after = [] if statement.bijectors is None else statement.bijectors
+    if not before and not after:
         raise ValueError(
             "bijectors: expected at least one for an actor that is not constrained yet, given "
-            "none; pass constrain(actor, *constraint_bijectors(env))"
+            "none; pass constrain(actor, env), or bijectors where there is no environment"
         )
-    before = head.bijectors if is_constrained else []
+    if env is None:
+        after = [*before, *after]
+    elif unknown := {each.name for each in before} - {each.name for each in after}:
+        raise ValueError(
+            f"env: expected one that publishes the constraints that the actor has, given one "
+            f"without {sorted(unknown)}; constrain the actor as it was before"
+        )
     constrained = ConstrainedFlowModule(
         spec,
-        [*before, *bijectors],
+        after,
         order=order,
         flow=flow,
         in_keys=parameter_keys,
@@ -118,6 +158,49 @@ def constrain(
         **_other_options(head),
     )
     return SafeProbabilisticTensorDictSequential(*body, constrained)
+
+
+class _Statement(NamedTuple):
+    """What was said of the constraints, by an environment or in its place."""
+
+    bijectors: list[ConstraintBijector] | None
+    spec: TensorSpec | None
+
+
+def _stated(
+    env: EnvBase | None,
+    bijectors: Sequence[ConstraintBijector] | None,
+    spec: TensorSpec | None,
+    order: Sequence[str] | None,
+) -> _Statement:
+    """Return the one statement of constraints and bounds, or refuse two."""
+    refuse_string("order", order)
+    if env is None:
+        return _Statement(None if bijectors is None else in_order(bijectors, None), spec)
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env: expected a TorchRL environment, given {type(env).__name__}; where there is "
+            "none, write bijectors=[...], spec=..."
+        )
+    for name, given in (("bijectors", bijectors), ("spec", spec)):
+        if given is not None:
+            raise ValueError(
+                f"{name}: expected none beside an environment, which states them, given both; "
+                "leave one out"
+            )
+    published = constraint_bijectors(env)
+    names = [each.name for each in published]
+    if order is not None and list(order) != names:
+        raise ValueError(
+            f"order: expected the environment's own, {names}, given {list(order)}; state the "
+            "priority once, in constrain_env(..., order=...)"
+        )
+    return _Statement(published, env.action_spec_unbatched)
+
+
+def _own_spec(head: Any, action_key: NestedKey) -> TensorSpec | None:
+    spec = getattr(head, "spec", None)
+    return None if isinstance(spec, Composite) and spec[action_key] is None else spec
 
 
 def with_reference_entropy(
@@ -200,16 +283,16 @@ def _parameter_keys(head: Any) -> list[NestedKey]:
             f"actor: expected a distribution over vectors, event_dims = 1, given {event_dims}"
         )
     names = [key if isinstance(key, str) else key[-1] for key in head.dist_keys]
-    if sorted(names) != ["loc", "scale"]:
+    if sorted(names) != [LOC_KEY, SCALE_KEY]:
         raise ValueError(
             "actor: expected a distribution that reads location and scale from the tensordict, "
             f"in_keys for 'loc' and 'scale', given {names}"
         )
     keys = dict(zip(names, head.in_keys, strict=True))
-    return [keys["loc"], keys["scale"]]
+    return [keys[LOC_KEY], keys[SCALE_KEY]]
 
 
-def _refuse_other_bounds(head: Any, bounds: Box) -> None:
+def _refuse_other_tanh_bounds(head: Any, bounds: Box) -> None:
     if head.distribution_class is not TanhNormal:
         return
     for name, usual, expected in (("low", -1.0, bounds.low), ("high", 1.0, bounds.high)):

@@ -7,46 +7,17 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
 
 from cnfp_torchrl.bijectors import Bijector, paper_squash
 from cnfp_torchrl.geometry import ConstraintSet
-
-ANCHOR_KEY = ("constraints", "anchor")
-
-
-class MissingGeometryError(KeyError):
-    """A tensordict lacks an entry that a constraint needs: names the key and what publishes it."""
-
-    def __str__(self) -> str:
-        # KeyError shows the repr of its message, with every quote escaped.
-        return str(self.args[0])
-
-
-def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
-    """Return an entry of a tensordict, or say how to get it there.
-
-    Raises:
-        MissingGeometryError: when it is missing.
-    """
-    value = tensordict.get(key, None)
-    if value is None:
-        found = sorted(map(str, tensordict.keys(True, True)))
-        raise MissingGeometryError(f"expected {key}, found keys {found}; {remedy}")
-    return value
-
-
-def refuse_string(argument: str, given: object) -> None:
-    """Refuse a string where a sequence of names is expected: it would be taken for its letters.
-
-    Raises:
-        TypeError: naming the argument and what to write instead.
-    """
-    if isinstance(given, str):
-        raise TypeError(
-            f"{argument}: expected a sequence of names, given the string {given!r}; write "
-            f"{argument}=[{given!r}]"
-        )
+from cnfp_torchrl.keys import (
+    ACTION_KEY,
+    LOG_DET_KEY,
+    active_key,
+    field_key,
+    refuse_string,
+    require,
+)
 
 
 class ConstraintBijector(TensorDictModuleBase):
@@ -56,10 +27,11 @@ class ConstraintBijector(TensorDictModuleBase):
     module pushes the sample through the constraint's own squash and adds the log-determinant.
 
     Args:
-        name: the constraint's name; its geometry lies at ``("constraints", name, FIELD)``.
-        set_type: the family of its sets, such as `cnfp_torchrl.geometry.Ball`.
-        sample_key: the sample ``(*batch, d)`` that `forward` replaces.
-        log_det_key: the log-determinant ``(*batch,)`` that `forward` adds to, from 0 if absent.
+        name: The constraint's name; its geometry lies at ``("constraints", name, FIELD)``.
+        set_type: The family of its sets, such as `cnfp_torchrl.geometry.Ball`.
+        sample_key: The key of the sample ``(*batch, d)`` that `forward` replaces.
+        log_det_key: The key of the log-determinant ``(*batch,)`` that `forward` adds to, from 0 if
+            absent.
 
     Raises:
         TypeError: when `set_type` is no subclass of `ConstraintSet`.
@@ -70,8 +42,8 @@ class ConstraintBijector(TensorDictModuleBase):
         name: str,
         set_type: type[ConstraintSet],
         *,
-        sample_key: NestedKey = "action",
-        log_det_key: NestedKey = "log_det",
+        sample_key: NestedKey = ACTION_KEY,
+        log_det_key: NestedKey = LOG_DET_KEY,
     ) -> None:
         super().__init__()
         if not (isinstance(set_type, type) and issubclass(set_type, ConstraintSet)):
@@ -83,16 +55,14 @@ class ConstraintBijector(TensorDictModuleBase):
         self.set_type = set_type
         self.sample_key = sample_key
         self.log_det_key = log_det_key
-        self.geometry_keys: list[NestedKey] = [
-            ("constraints", name, f) for f in set_type.event_dims
-        ]
+        self.geometry_keys: list[NestedKey] = [field_key(name, f) for f in set_type.event_dims]
         self.in_keys = [*self.geometry_keys, sample_key]
         self.out_keys = [sample_key, log_det_key]
 
     @property
     def active_key(self) -> NestedKey:
         """Where `ConstraintAnchor` says whether the constraint holds in a state."""
-        return ("constraints", self.name, "active")
+        return active_key(self.name)
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the sets of allowed actions; their values were checked when published.
@@ -131,8 +101,8 @@ def in_order(
     """Return the bijectors in order of application: lowest priority first, highest last.
 
     Args:
-        bijectors: one for each constraint.
-        order: names of the constraints in order of application; None takes the bijectors' own.
+        bijectors: One for each constraint.
+        order: The constraints' names in order of application; None takes the bijectors' own.
 
     Raises:
         TypeError: when a bijector is none, or the order is a string.
@@ -141,8 +111,8 @@ def in_order(
     for each in bijectors:
         if not isinstance(each, ConstraintBijector):
             raise TypeError(
-                f"bijectors: expected each to be a ConstraintBijector, given {type(each).__name__};"
-                " unpack a list of them: constrain(actor, *constraint_bijectors(env))"
+                "bijectors: expected a sequence of ConstraintBijector, given one with a "
+                f"{type(each).__name__} in it; write bijectors=constraint_bijectors(env)"
             )
     refuse_string("order", order)
     names = [bijector.name for bijector in bijectors]

@@ -11,18 +11,15 @@ from tensordict.nn import InteractionType, set_interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import TensorSpec
 from torchrl.modules import SafeProbabilisticModule
 
 from cnfp_torchrl.bijectors import Bijector
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Box, Region
-from cnfp_torchrl.modules.constraint_bijector import (
-    ANCHOR_KEY,
-    ConstraintBijector,
-    in_order,
-    require,
-)
+from cnfp_torchrl.keys import ACTION_KEY, ANCHOR_KEY, LOC_KEY, SCALE_KEY, require
+from cnfp_torchrl.modules.action_bounds import ActionBounds, action_bounds
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
 from cnfp_torchrl.modules.flows import Flow, resolve_flow
 
 _ANCHOR_REMEDY = "append cnfp_torchrl.envs.ConstraintAnchor after the geometry transforms"
@@ -60,8 +57,6 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     """
 
     distribution_type: type[ConstrainedFlow] = ConstrainedFlow
-    low: Tensor
-    high: Tensor
 
     def __init__(
         self,
@@ -70,8 +65,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         *,
         order: Sequence[str] | None = None,
         flow: Flow | str = "exact",
-        in_keys: Sequence[NestedKey] = ("loc", "scale"),
-        out_key: NestedKey = "action",
+        in_keys: Sequence[NestedKey] = (LOC_KEY, SCALE_KEY),
+        out_key: NestedKey = ACTION_KEY,
         return_log_prob: bool = False,
         default_interaction_type: InteractionType = InteractionType.RANDOM,
         **kwargs: Any,
@@ -85,10 +80,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return_log_prob=return_log_prob,
             **kwargs,
         )
-        bounds = action_bounds(spec, out_key)
-        self.action_dtype = bounds.dtype
-        self.register_buffer("low", bounds.low, persistent=False)
-        self.register_buffer("high", bounds.high, persistent=False)
+        self._bounds = ActionBounds(action_bounds(spec, out_key))
         self._bijectors = nn.ModuleList(in_order(bijectors, order))
         self.flow = resolve_flow(flow)
         if return_log_prob and not self.flow.has_density:
@@ -112,7 +104,17 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     @property
     def bounds(self) -> Box:
         """The action bounds, stage 0, in the dtype of the action spec."""
-        return Box(self.low, self.high, validate_args=False).to(self.action_dtype)
+        return self._bounds.on(None)
+
+    @property
+    def action_dim(self) -> int:
+        """The number of components of an action."""
+        return self._bounds.dim
+
+    @property
+    def action_dtype(self) -> torch.dtype:
+        """The dtype of the action spec, in which actions are executed."""
+        return self._bounds.dtype
 
     @property
     def action_key(self) -> NestedKey:
@@ -141,7 +143,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         Raises:
             MissingGeometryError: when geometry, anchor or active flags are missing.
         """
-        bounds = self.bounds
+        bounds = self._bounds_beside(tensordict)
         if not self.flow.reads_constraints:
             return self.flow(bounds, [], None, None)
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
@@ -154,7 +156,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         """Return the region of allowed actions, for any flow; needs anchor and active flags."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
         anchor, active = self._anchor(tensordict), self._active(tensordict)
-        return Region((self.bounds, *sets), anchor, active)
+        return Region((self._bounds_beside(tensordict), *sets), anchor, active)
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
@@ -176,11 +178,20 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
         The safe counterpart of TorchRL's method, which draws uniformly from the action spec.
         """
-        zeros = self.low.new_zeros(*tensordict.shape, *self.low.shape)
+        like = self._bounds_beside(tensordict).low
+        zeros = like.new_zeros(*tensordict.shape, self.action_dim)
         for key, value in zip(self.parameter_keys, (zeros, torch.ones_like(zeros)), strict=True):
             tensordict.set(key, value)
         with set_interaction_type(InteractionType.RANDOM):
             return self(tensordict)
+
+    def _bounds_beside(self, tensordict: TensorDictBase) -> Box:
+        """Return the bounds on the device of a tensordict's entries."""
+        device = tensordict.device
+        if device is None:
+            found = (tensordict.get(key, None) for key in self.in_keys)
+            device = next((value.device for value in found if value is not None), None)
+        return self._bounds.on(device)
 
     def _anchor(self, tensordict: TensorDictBase) -> Tensor:
         return require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
@@ -198,42 +209,3 @@ class ReferenceEntropyFlowModule(ConstrainedFlowModule):
     """The same actions, scored for losses by the reference entropy (`ReferenceEntropyFlow`)."""
 
     distribution_type = ReferenceEntropyFlow
-
-
-def action_bounds(spec: TensorSpec, action_key: NestedKey = "action") -> Box:
-    """Return the bounds of an action spec as one box, ``(d,)``.
-
-    Args:
-        spec: a bounded spec, or a composite with one at `action_key`; batch dimensions must agree.
-        action_key: where the action lies in a composite spec.
-
-    Raises:
-        ValueError: when the spec has no finite bounds or they differ along batch dimensions.
-    """
-    leaf = spec[action_key] if isinstance(spec, Composite) else spec
-    bounds = _finite_bounds(leaf)
-    given = f"given {type(leaf).__name__} of shape {tuple(getattr(leaf, 'shape', ()))}"
-    if bounds is None:
-        raise ValueError(
-            f"spec of '{action_key}': expected a continuous spec of vectors with bounds on both "
-            f"sides, the first stage of every flow, {given}"
-        )
-    low, high = (bound.reshape(-1, bound.shape[-1]) for bound in bounds)
-    if bool((low != low[0]).any() | (high != high[0]).any()):
-        raise ValueError(
-            f"spec of '{action_key}': expected the same bounds for all batch elements, {given}; "
-            "pass env.action_spec_unbatched"
-        )
-    return Box(low[0].clone(), high[0].clone())
-
-
-def _finite_bounds(leaf: Any) -> tuple[Tensor, Tensor] | None:
-    space = getattr(leaf, "space", None)
-    low, high = getattr(space, "low", None), getattr(space, "high", None)
-    if not isinstance(low, Tensor) or not isinstance(high, Tensor):
-        return None
-    if low.ndim == 0 or not low.is_floating_point():
-        return None
-    # TorchRL gives unbounded specs the largest numbers of their dtype for bounds.
-    limits = torch.finfo(low.dtype)
-    return (low, high) if bool(((low > limits.min) & (high < limits.max)).all()) else None

@@ -27,12 +27,9 @@ from torchrl.modules import (
 )
 
 from cnfp_torchrl.distributions import ConstrainedFlow
+from cnfp_torchrl.keys import LATENT_KEY, LATENT_LOG_PROB_KEY, require
 from cnfp_torchrl.modules.actors import actor_modules, flow_head
-from cnfp_torchrl.modules.constraint_bijector import require
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
-
-LATENT_KEY = "latent"
-LATENT_LOG_PROB_KEY = "latent_log_prob"
 
 
 class FlowMap(TensorDictModuleBase):
@@ -62,9 +59,9 @@ class FlowMap(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action ``(*batch, d)``."""
         latent = require(tensordict, self.latent_key, "put a module that writes it before the map")
-        if latent.shape[-1:] != self.head.low.shape:
+        if latent.shape[-1:] != (self.head.action_dim,):
             raise ValueError(
-                f"key {self.latent_key!r}: expected latents of {self.head.low.shape[-1]} "
+                f"key {self.latent_key!r}: expected latents of {self.head.action_dim} "
                 f"components, as the action has, given shape {tuple(latent.shape)}"
             )
         bijector = self.head.get_bijector(tensordict)

@@ -64,8 +64,8 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
     action_size = env.action_spec_unbatched.shape[-1]
     return make_constrained_actor(
         instantiate(config.network.actor, observation_size, action_size),
-        env.action_spec_unbatched,
-        constraint_bijectors(env) if config.env.geometry else [],
+        bijectors=constraint_bijectors(env) if config.env.geometry else [],
+        spec=env.action_spec_unbatched,
         order=list(config.flow.order),
         flow=instantiate(config.flow.combine),
     )

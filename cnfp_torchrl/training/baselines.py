@@ -27,7 +27,8 @@ class StandStill(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write zeros."""
-        zeros = self.head.low.new_zeros(*tensordict.shape, *self.head.low.shape)
+        bounds = self.head.bounds
+        zeros = bounds.low.new_zeros(*tensordict.shape, bounds.dim)
         return tensordict.set(self.head.action_key, zeros)
 
 

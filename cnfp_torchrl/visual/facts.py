@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs.geometry_transform import appended_transforms
+from cnfp_torchrl.envs import appended_transforms
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry
 from cnfp_torchrl.tasks.point_nav.geometry import PointNavGeometry, read_observation
 from cnfp_torchrl.tasks.point_nav.shortest_path import side_distances

@@ -12,8 +12,8 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.bijectors import SquashChain, has_latent
 from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import flow_head
-from cnfp_torchrl.modules.constraint_bijector import require
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, snapshot_of
 from cnfp_torchrl.visual.staged_flow import StagedFlow
 

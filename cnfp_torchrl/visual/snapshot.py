@@ -15,8 +15,8 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.bijectors import has_latent
 from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
-from cnfp_torchrl.modules.constraint_bijector import ANCHOR_KEY
 from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 

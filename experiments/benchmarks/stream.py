@@ -31,7 +31,6 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -65,9 +64,7 @@ def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
         order=["battery", "obstacle"],
         with_anchor=True,
     )
-    actor = make_constrained_actor(
-        StandardNormal(), env.action_spec_unbatched, constraint_bijectors(env)
-    )
+    actor = make_constrained_actor(StandardNormal(), env)
     return env, actor
 
 

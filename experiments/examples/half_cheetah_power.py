@@ -13,9 +13,7 @@ from sac_made_safe import make_actor, train
 from tensordict import TensorDictBase
 from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import GeometryTransform, constrain_env, constraint_bijectors
-from cnfp_torchrl.geometry import WeightedL1Ball
-from cnfp_torchrl.modules import constrain
+from cnfp_torchrl import GeometryTransform, WeightedL1Ball, constrain, constrain_env
 
 
 class PowerLimit(GeometryTransform):
@@ -33,7 +31,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cheetah = TransformedEnv(GymEnv("HalfCheetah-v5"), DoubleToFloat())
     env = constrain_env(cheetah, PowerLimit("power"))
-    actor = constrain(make_actor(env), *constraint_bijectors(env))
+    actor = constrain(make_actor(env), env)
     steps = train(env, actor, steps=arguments.steps, updates=8)
     power = (steps["observation"][..., 11:].double() * steps["action"].double()).abs().sum(-1)
     print(f"power: mean {power.mean():.2f}, largest {power.max():.6f}, limit 20")

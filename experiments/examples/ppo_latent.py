@@ -11,8 +11,8 @@ from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cnfp_torchrl.envs import constrain_env, constraint_bijectors
-from cnfp_torchrl.modules import make_constrained_actor, split_at_latent
+from cnfp_torchrl import constrain_env, make_constrained_actor
+from cnfp_torchrl.modules import split_at_latent
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
@@ -29,9 +29,8 @@ def main() -> None:
 
     base_env = PointNavEnv([arguments.agents], seed=arguments.seed)
     env = constrain_env(base_env, BatteryGeometry(), ObstacleGeometry())
-    bijectors = constraint_bijectors(env)
     network = torch.nn.Sequential(MLP(5, 4, num_cells=[64, 64]), NormalParamExtractor())
-    actor = make_constrained_actor(network, env.action_spec_unbatched, bijectors)
+    actor = make_constrained_actor(network, env)
     policy, latent_actor = split_at_latent(actor)  # for the collector, and for the loss
 
     critic = ValueOperator(MLP(5, 1, num_cells=[64, 64]), in_keys=["observation"])

@@ -23,8 +23,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cnfp_torchrl.envs import constrain_env, constraint_bijectors
-from cnfp_torchrl.modules import constrain
+from cnfp_torchrl import constrain, constrain_env
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
@@ -45,7 +44,7 @@ def main() -> None:
         # The environment publishes what each state allows, the last constraint first; the actor
         # heeds it.
         env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
-        actor = constrain(actor, *constraint_bijectors(env))
+        actor = constrain(actor, env)
 
     steps = train(env, actor, steps=arguments.steps, updates=arguments.updates)
     reward, last = steps["next", "reward"], -len(steps) // 4

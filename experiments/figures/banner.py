@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -44,9 +43,7 @@ def main(path: Path) -> None:
         order=ORDER,
         with_anchor=True,
     )
-    actor = make_constrained_actor(
-        StandardNormal(), env.action_spec_unbatched, constraint_bijectors(env), order=ORDER
-    )
+    actor = make_constrained_actor(StandardNormal(), env)
     state = env.reset(position=POSITION, battery=BATTERY, goal=GOAL)
     snapshot = take_snapshot(actor, state, samples=700)
     save_png(flow_banner(snapshot, LAYOUT), path, dpi=DPI)

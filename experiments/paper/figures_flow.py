@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
@@ -204,10 +203,7 @@ def snapshot(policy: KeptPolicy, name: str) -> FlowSnapshot:
     )
     loc, scale = (torch.tensor(each) for each in policy.gaussians[name])
     actor: SafeProbabilisticTensorDictSequential = make_constrained_actor(
-        FixedGaussian(loc, scale),
-        env.action_spec_unbatched,
-        constraint_bijectors(env),
-        order=ORDER,
+        FixedGaussian(loc, scale), env
     )
     return take_snapshot(actor, _reset(env, PLACES[name]))
 

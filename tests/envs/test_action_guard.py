@@ -21,7 +21,7 @@ from torchrl.envs import (
 )
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import ActionGuard, constrain_env, constraint_bijectors
+from cnfp_torchrl.envs import ActionGuard, constrain_env
 from cnfp_torchrl.modules import ConstraintViolationError, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import (
     POINT_NAV_ID,
@@ -45,7 +45,7 @@ def guarded_env(*batch_size: int, steps: int = 17) -> TransformedEnv:
 
 def untrained_actor(env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
     network = gaussian_network(5, 2, hidden=[8])
-    return make_constrained_actor(network, env.action_spec_unbatched, constraint_bijectors(env))
+    return make_constrained_actor(network, env)
 
 
 def assert_guards(env: EnvBase, actor: SafeProbabilisticTensorDictSequential) -> None:

@@ -119,15 +119,26 @@ def test_copies(copied: Callable[[TransformedEnv], TransformedEnv]) -> None:
     assert torch.equal(again["constraints", "anchor"], same["constraints", "anchor"])
 
 
-def test_the_action_bounds_move_with_the_environment() -> None:
+def test_another_dtype_does_not_move_the_action_bounds() -> None:
     env = point_nav(3)
     env.reset()
-    buffers = dict(env.transform[-1].to("meta").named_buffers())
-    assert {name: bound.device.type for name, bound in buffers.items()} == {
-        "_low": "meta",
-        "_high": "meta",
-    }
-    assert not env.transform[-1].state_dict()
+    anchor = env.transform[-1]
+    before = anchor.clone()
+    anchor.half()
+    assert not anchor.state_dict()
+    state = env.reset()
+    assert torch.equal(
+        before(state.clone())["constraints", "anchor"], state["constraints", "anchor"]
+    )
+
+
+def test_a_clone_of_an_anchor_keeps_the_bounds_though_nothing_was_reset() -> None:
+    env = point_nav(3)
+    clone = env.transform[-1].clone()
+    state = env.reset()
+    assert torch.equal(
+        clone(state.clone())["constraints", "anchor"], state["constraints", "anchor"]
+    )
 
 
 # Inside -------------------------------------------------------------------------------------------

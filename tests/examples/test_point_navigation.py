@@ -92,7 +92,7 @@ def test_the_sac_actor_itself_learns(load: Callable[[str], ModuleType]) -> None:
     script = load("sac_made_safe")
     env = constrain_env(PointNavEnv([8], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = script.make_actor(env)
-    safe = script.constrain(actor, *script.constraint_bijectors(env))
+    safe = script.constrain(actor, env)
     before = [parameter.detach().clone() for parameter in actor.parameters()]
     steps = script.train(env, safe, steps=128, updates=1)
     assert steps.shape == (128,)

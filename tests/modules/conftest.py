@@ -63,8 +63,8 @@ def make_actor(env: TransformedEnv, network: nn.Module) -> ActorFactory:
     """`make_constrained_actor` for the environment; a network or options may be given."""
 
     def make(network: nn.Module = network, **options: object) -> ProbabilisticActor:
-        spec, bijectors = env.action_spec_unbatched, constraint_bijectors(env)
-        return make_constrained_actor(network, spec, bijectors, **{"order": ORDER, **options})
+        stated = {"spec": env.action_spec_unbatched, "bijectors": constraint_bijectors(env)}
+        return make_constrained_actor(network, **stated, **options)
 
     return make
 

@@ -80,7 +80,7 @@ def test_without_binding_constraints_a_tanh_actor_is_unchanged(
     # A second tanh would move the action by up to 1 - tanh(1) = 0.24.
     actor = make_tanh_actor(return_log_prob=True)
     many = unbound.expand(100, 8).clone()
-    expected, got = act(actor, many), act(constrain(actor, *bijectors), many)
+    expected, got = act(actor, many), act(constrain(actor, bijectors=bijectors), many)
     assert expected["action"].abs().max() > 0.9
     torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
     torch.testing.assert_close(
@@ -92,7 +92,7 @@ def test_an_independent_normal_becomes_the_base(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], unbound: TensorDictBase
 ) -> None:
     actor = make_tanh_actor(distribution_class=IndependentNormal)
-    latent, got = act(actor, unbound)["action"], act(constrain(actor, *bijectors), unbound)
+    latent, got = act(actor, unbound)["action"], act(constrain(actor, bijectors=bijectors), unbound)
     torch.testing.assert_close(got["action"], latent.tanh(), rtol=0, atol=2 * EROSION)
 
 
@@ -109,7 +109,7 @@ def test_constraints_hold_that_did_not(
     actor = make_tanh_actor(distribution_class=distribution)
     many = state.expand(500, 8).clone()
     before = inside(act(actor, many))
-    after = inside(act(constrain(actor, *bijectors, flow=flow), many))
+    after = inside(act(constrain(actor, bijectors=bijectors, flow=flow), many))
     for name in ("battery", "obstacle"):
         assert not before[name].all()
         assert after[name].all()
@@ -122,7 +122,7 @@ def test_networks_are_shared(
     state: TensorDictBase,
 ) -> None:
     actor = make_tanh_actor()
-    constrained = constrain(actor, *bijectors)
+    constrained = constrain(actor, bijectors=bijectors)
     assert [id(each) for each in constrained.parameters()] == [id(p) for p in network.parameters()]
     before = actor(state.clone())["loc"]
     constrained(state.clone())["action"].sum().backward()
@@ -135,7 +135,7 @@ def test_a_checkpoint_of_the_actor_fits_the_constrained_one(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
 ) -> None:
     actor = make_tanh_actor()
-    assert constrain(actor, *bijectors).state_dict().keys() == actor.state_dict().keys()
+    assert constrain(actor, bijectors=bijectors).state_dict().keys() == actor.state_dict().keys()
 
 
 def test_the_actor_itself_is_left_alone(
@@ -143,7 +143,7 @@ def test_the_actor_itself_is_left_alone(
 ) -> None:
     actor = make_tanh_actor()
     before = act(actor, state)["action"]
-    constrain(actor, *bijectors)
+    constrain(actor, bijectors=bijectors)
     assert type(actor.get_dist(state.clone())) is TanhNormal
     assert torch.equal(act(actor, state)["action"], before)
 
@@ -180,7 +180,7 @@ def test_keys_stay(
         return_log_prob=True,
         log_prob_key=log_prob_key,
     )
-    constrained = constrain(actor, *bijectors)
+    constrained = constrain(actor, bijectors=bijectors)
     assert constrained.in_keys[0] == "obs"
     assert set(constrained.out_keys) == set(actor.out_keys)
     state = unbound.set("obs", unbound["observation"])
@@ -196,7 +196,7 @@ def test_the_default_interaction_type_stays(
     state: TensorDictBase,
     kind: InteractionType,
 ) -> None:
-    actor = constrain(make_tanh_actor(default_interaction_type=kind), *bijectors)
+    actor = constrain(make_tanh_actor(default_interaction_type=kind), bijectors=bijectors)
     repeats = torch.equal(actor(state.clone())["action"], actor(state.clone())["action"])
     assert repeats == (kind is InteractionType.DETERMINISTIC)
 
@@ -205,7 +205,7 @@ def test_several_samples_at_once(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
 ) -> None:
     actor = make_tanh_actor(num_samples=3, default_interaction_type=InteractionType.RANDOM)
-    assert constrain(actor, *bijectors)(state)["action"].shape == (3, 8, 2)
+    assert constrain(actor, bijectors=bijectors)(state)["action"].shape == (3, 8, 2)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,9 @@ def test_order(
     order: list[str] | None,
     expected: list[str],
 ) -> None:
-    assert flow_head(constrain(make_tanh_actor(), *bijectors, order=order)).order == expected
+    assert (
+        flow_head(constrain(make_tanh_actor(), bijectors=bijectors, order=order)).order == expected
+    )
 
 
 # Actors of other shapes ---------------------------------------------------------------------------
@@ -234,7 +236,7 @@ def test_a_policy_that_shares_its_body_with_a_critic(
     value = ValueOperator(nn.Linear(5, 1), in_keys=["observation"])
     shared = ActorValueOperator(body, make_tanh_actor(), value)
     actor = shared.get_policy_operator()
-    constrained = constrain(actor, *bijectors)
+    constrained = constrain(actor, bijectors=bijectors)
     expected, got = act(actor, unbound), act(constrained, unbound)
     torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
     assert {id(each) for each in constrained.parameters()} == {id(p) for p in actor.parameters()}
@@ -248,7 +250,7 @@ def test_an_actor_with_named_modules(
         ["loc", "scale"], ["action"], distribution_class=TanhNormal
     )
     actor = ProbabilisticTensorDictSequential(OrderedDict(body=body, head=head))
-    constrained = constrain(actor, *bijectors, spec=Bounded(-1, 1, (2,)))
+    constrained = constrain(actor, bijectors=bijectors, spec=Bounded(-1, 1, (2,)))
     expected, got = act(actor, unbound), act(constrained, unbound)
     torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
 
@@ -257,22 +259,22 @@ def test_constraining_twice_keeps_both(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
 ) -> None:
     battery, obstacle = bijectors
-    once = constrain(make_tanh_actor(), battery, flow="radial")
-    twice = constrain(once, obstacle)
+    once = constrain(make_tanh_actor(), bijectors=[battery], flow="radial")
+    twice = constrain(once, bijectors=[obstacle])
     assert flow_head(once).order == ["battery"]
     assert flow_head(twice).order == ["battery", "obstacle"]
-    both = constrain(make_tanh_actor(), battery, obstacle)
+    both = constrain(make_tanh_actor(), bijectors=[battery, obstacle])
     assert torch.equal(act(twice, state)["action"], act(both, state)["action"])
-    turned = constrain(once, obstacle, order=["obstacle", "battery"])
+    turned = constrain(once, bijectors=[obstacle], order=["obstacle", "battery"])
     assert flow_head(turned).order == ["obstacle", "battery"]
     with pytest.raises(ValueError, match="exactly once"):
-        constrain(once, battery)
+        constrain(once, bijectors=[battery])
 
 
 def test_constraining_again_may_change_the_flow_alone(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
 ) -> None:
-    actor = constrain(make_tanh_actor(), *bijectors)
+    actor = constrain(make_tanh_actor(), bijectors=bijectors)
     again = constrain(actor, flow="gauge", order=["obstacle", "battery"])
     assert isinstance(flow_head(again).flow, GaugeFlow)
     assert flow_head(again).order == ["obstacle", "battery"]
@@ -281,24 +283,79 @@ def test_constraining_again_may_change_the_flow_alone(
 def test_the_order_is_the_environments(make_tanh_actor: MakeActor) -> None:
     order = ["obstacle", "battery"]
     env = constrain_env(PointNavEnv([8]), BatteryGeometry(), ObstacleGeometry(), order=order)
-    assert flow_head(constrain(make_tanh_actor(), *constraint_bijectors(env))).order == order
+    assert flow_head(constrain(make_tanh_actor(), env)).order == order
 
 
 # What is refused ----------------------------------------------------------------------------------
 
 
 def test_an_actor_cannot_be_constrained_by_nothing(make_tanh_actor: MakeActor) -> None:
-    with pytest.raises(ValueError, match=r"bijectors: expected at least one.*given none; pass"):
+    with pytest.raises(ValueError, match=r"bijectors: expected at least one.*given none"):
         constrain(make_tanh_actor())
 
 
-def test_a_list_of_bijectors_must_be_unpacked(
-    make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+def test_what_is_no_environment_or_bijector_is_refused(
+    env: TransformedEnv, make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
 ) -> None:
-    for not_unpacked in (bijectors, tuple(bijectors)):
-        message = f"bijectors: .*given {type(not_unpacked).__name__}; unpack"
-        with pytest.raises(TypeError, match=message):
-            constrain(make_tanh_actor(), not_unpacked)  # type: ignore[arg-type]
+    for other in (bijectors, bijectors[0], env.action_spec_unbatched):
+        with pytest.raises(TypeError, match=f"env: .*given {type(other).__name__}.*bijectors="):
+            constrain(make_tanh_actor(), other)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"bijectors: expected a sequence of Constr.*with a list"):
+        constrain(make_tanh_actor(), bijectors=[bijectors])  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("make", [constrain, make_constrained_actor], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("stated", ["bijectors", "spec", "order"])
+def test_two_statements_are_refused(
+    env: TransformedEnv,
+    make_tanh_actor: MakeActor,
+    network: nn.Module,
+    bijectors: list[ConstraintBijector],
+    make: MakeActor,
+    stated: str,
+) -> None:
+    second = {
+        "bijectors": bijectors,
+        "spec": env.action_spec_unbatched,
+        "order": ["obstacle", "battery"],
+    }
+    given = make_tanh_actor() if make is constrain else network
+    with pytest.raises(ValueError, match=f"^{stated}: "):
+        make(given, env, **{stated: second[stated]})
+    assert flow_head(make(given, env, order=["battery", "obstacle"])).order == [
+        each.name for each in bijectors
+    ]
+
+
+def test_neither_environment_nor_what_takes_its_place(
+    network: nn.Module, bijectors: list[ConstraintBijector]
+) -> None:
+    with pytest.raises(ValueError, match=r"^bijectors: .*nor bijectors"):
+        make_constrained_actor(network)
+    with pytest.raises(ValueError, match=r"^spec: .*nor spec"):
+        make_constrained_actor(network, bijectors=bijectors)
+
+
+def test_an_actor_with_other_bounds_than_its_environments(
+    env: TransformedEnv, make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    twice = {"spec": Bounded(-2.0, 2.0, (2,)), "distribution_kwargs": {"low": -2.0, "high": 2.0}}
+    normal = {"spec": Bounded(-2.0, 2.0, (2,)), "distribution_class": IndependentNormal}
+    for options in (twice, normal):
+        actor = make_tanh_actor(**options)
+        for other in (actor, constrain(actor, bijectors=bijectors)):
+            with pytest.raises(ValueError, match=re.escape("given low [-2.0, -2.0]")):
+                constrain(other, env)
+
+
+def test_a_constrained_actor_takes_its_constraints_from_the_environment_again(
+    env: TransformedEnv, make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector]
+) -> None:
+    obstacle_alone = constrain(make_tanh_actor(), bijectors=bijectors[1:])
+    assert flow_head(constrain(obstacle_alone, env)).order == ["battery", "obstacle"]
+    unknown = constrain(make_tanh_actor(), bijectors=[ConstraintBijector("speed", Ball)])
+    with pytest.raises(ValueError, match=re.escape("without ['speed']")):
+        constrain(unknown, env)
 
 
 def test_a_string_is_no_sequence_of_names(
@@ -309,12 +366,12 @@ def test_a_string_is_no_sequence_of_names(
 ) -> None:
     message = re.escape("order: expected a sequence of names, given the string 'battery'; write")
     with pytest.raises(TypeError, match=message):
-        constrain(make_tanh_actor(), bijectors[0], order="battery")
+        constrain(make_tanh_actor(), bijectors=bijectors[:1], order="battery")
     spec = env.action_spec_unbatched
     with pytest.raises(TypeError, match=message):
-        make_constrained_actor(network, spec, bijectors[:1], order="battery")
+        make_constrained_actor(network, spec=spec, bijectors=bijectors[:1], order="battery")
     with pytest.raises(TypeError, match=re.escape("write in_keys=['observation']")):
-        make_constrained_actor(network, spec, bijectors, in_keys="observation")
+        make_constrained_actor(network, env, in_keys="observation")
 
 
 @pytest.mark.parametrize(
@@ -343,7 +400,7 @@ def test_other_distributions_are_refused(make_tanh_actor: MakeActor, distributio
             "given ['loc', 'scale', 'upscale']",
             id="third parameter",
         ),
-        pytest.param({"spec": None}, "the actor has none; pass constrain(..., spec=", id="no spec"),
+        pytest.param({"spec": None}, "the actor has none; pass", id="no spec"),
         pytest.param(
             {"distribution_kwargs": {"low": -0.5, "high": 1.0}},
             "spec's low [-1.0, -1.0], given -0.5; build it with distribution_kwargs={'low': ",
@@ -361,14 +418,14 @@ def test_what_would_change_silently_is_refused(
     message: str,
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        constrain(make_tanh_actor(**options), *bijectors)
+        constrain(make_tanh_actor(**options), bijectors=bijectors)
 
 
 def test_a_spec_can_be_handed_in(
     make_tanh_actor: MakeActor, bijectors: list[ConstraintBijector], state: TensorDictBase
 ) -> None:
     actor = make_tanh_actor(spec=None)
-    constrained = constrain(actor, *bijectors, spec=Bounded(-1, 1, (2,)))
+    constrained = constrain(actor, bijectors=bijectors, spec=Bounded(-1, 1, (2,)))
     assert constrained(state)["action"].shape == (8, 2)
 
 
@@ -377,7 +434,9 @@ def test_bounds_of_the_tanh_normal_may_be_tensors(
 ) -> None:
     spec = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 3.0]))
     limits = {"low": spec.space.low, "high": spec.space.high}
-    head = flow_head(constrain(make_tanh_actor(spec=spec, distribution_kwargs=limits), *bijectors))
+    head = flow_head(
+        constrain(make_tanh_actor(spec=spec, distribution_kwargs=limits), bijectors=bijectors)
+    )
     assert head.bounds.low.tolist() == [-1, 0]
     assert head.bounds.high.tolist() == [1, 3]
 
@@ -386,7 +445,7 @@ def test_what_is_no_actor_is_refused(network: nn.Module) -> None:
     body = TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"])
     for other in (network, body, TensorDictSequential(body)):
         with pytest.raises(TypeError, match=f"actor: expected.*given {type(other).__name__}"):
-            constrain(other, ConstraintBijector("limit", Ball))  # type: ignore[arg-type]
+            constrain(other, bijectors=[ConstraintBijector("limit", Ball)])  # type: ignore[arg-type]
 
 
 def test_what_is_not_constrained_has_no_flow(make_tanh_actor: MakeActor) -> None:

@@ -10,7 +10,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -68,9 +67,8 @@ def _make_env(seed: int) -> TransformedEnv:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_multi_sync_collector(workers: int) -> None:
     env = _make_env(0)
-    network, spec = gaussian_network(5, 2, hidden=[8]), env.action_spec_unbatched
-    bijectors = constraint_bijectors(env)
-    actor = make_constrained_actor(network, spec, bijectors, return_log_prob=True)
+    network = gaussian_network(5, 2, hidden=[8])
+    actor = make_constrained_actor(network, env, return_log_prob=True)
     collector = MultiSyncCollector(
         [partial(_make_env, seed) for seed in range(workers)],
         actor,

@@ -12,8 +12,7 @@ from torch.distributions import Independent, Normal
 from cnfp_torchrl.bijectors import SquashChain
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, HalfSpaces
-from cnfp_torchrl.modules import ConstraintBijector
-from cnfp_torchrl.modules.constraint_bijector import in_order
+from cnfp_torchrl.modules import ConstraintBijector, in_order
 
 BATCH, DIM = 5, 3
 
@@ -159,5 +158,5 @@ def test_a_string_is_no_order() -> None:
 
 @pytest.mark.parametrize("wrong", ["a", [ConstraintBijector("a", Box)], Box])
 def test_what_is_no_bijector_has_no_place_in_an_order(wrong: object) -> None:
-    with pytest.raises(TypeError, match="expected each to be a ConstraintBijector, given"):
+    with pytest.raises(TypeError, match="bijectors: expected a sequence of ConstraintBijector"):
         in_order([ConstraintBijector("b", Box), wrong], None)  # type: ignore[list-item]

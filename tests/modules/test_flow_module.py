@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import NormalParamExtractor, ValueOperator
+from torchrl.objectives import SACLoss
 
 from cnfp_torchrl.bijectors import (
     BoxSquash,
@@ -27,12 +29,13 @@ from cnfp_torchrl.modules import (
     Flow,
     ProjectionFlow,
     SquashFlow,
+    action_bounds,
     constrain,
+    constraint_bijectors,
     flow_head,
     make_constrained_actor,
     with_reference_entropy,
 )
-from cnfp_torchrl.modules.flow_module import action_bounds
 
 FLOWS = ["exact", "gauge", "radial", "squash", "unconstrained"]
 EXACT_FLOWS = ["exact", "gauge", "radial"]
@@ -417,8 +420,50 @@ def test_actions_on_float64_geometry_are_allowed(
 
 
 def test_moving_to_a_device_takes_the_bounds_along(make_actor: MakeActor) -> None:
-    actor = make_actor().to("meta")
-    assert {tensor.device.type for tensor in flow_head(actor).buffers()} == {"meta"}
+    head = flow_head(make_actor())
+    where = TensorDict(device="meta").set("loc", torch.zeros(2))
+    assert (
+        ConstrainedFlowModule(head.spec, [], flow="unconstrained")
+        .get_bijector(where)
+        .image.low.is_meta
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda module: module.half(),
+        lambda module: module.bfloat16(),
+        lambda module: module.double(),
+        lambda module: module.to(torch.float16),
+        lambda module: module.to("meta").to_empty(device="cpu"),
+        lambda module: module.apply(lambda each: each._apply(lambda tensor: tensor * 2)),
+    ],
+)
+def test_nothing_else_changes_the_bounds(change: Callable[..., nn.Module]) -> None:
+    # 0.1 lies beyond its float16 and bfloat16 neighbors.
+    head = ConstrainedFlowModule(Bounded(-0.1, 0.1, (2,)), [])
+    before = head.bounds
+    change(head)
+    assert torch.equal(head.bounds.low, before.low)
+    assert torch.equal(head.bounds.high, before.high)
+
+
+def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(
+    make_actor: MakeActor, env: TransformedEnv, state: TensorDictBase
+) -> None:
+    def loss_of(spec: TensorSpec) -> SACLoss:
+        network = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
+        actor = make_constrained_actor(
+            network, bijectors=constraint_bijectors(env), spec=spec, flow="exact"
+        )
+        value = ValueOperator(nn.Linear(7, 1), in_keys=["observation", "action"])
+        return SACLoss(actor, value, action_spec=spec)
+
+    wide, narrow = loss_of(Bounded(-3.0, 3.0, (2,))), loss_of(Bounded(-0.1, 0.1, (2,)))
+    narrow.load_state_dict(wide.state_dict())
+    assert flow_head(narrow.actor_network).bounds.high.tolist() == pytest.approx([0.1, 0.1])
+    assert not any("bound" in key for key in narrow.state_dict())
 
 
 def test_the_compiled_actor_is_one_graph_and_acts_alike(
@@ -444,7 +489,7 @@ CONTINUOUS = "expected a continuous spec of vectors with bounds on both sides"
     ("spec", "key"),
     [
         (Bounded(-1, 2.0, (3,)), "action"),
-        (Bounded(-1, 2.0, (4, 2, 3)), "action"),
+        (Composite(action=Bounded(-1, 2.0, (4, 2, 3)), shape=(4, 2)), "action"),
         (Composite(action=Bounded(-1, 2.0, (3,))), "action"),
         (Composite(agent=Composite(move=Bounded(-1, 2.0, (3,)))), ("agent", "move")),
         (Bounded(torch.tensor([-1.0, -1.0, -1.0]), torch.tensor([2.0, 2.0, 2.0])), "action"),
@@ -468,16 +513,17 @@ def test_action_bounds_are_one_box(spec: TensorSpec, key: str | tuple[str, ...])
         pytest.param(Bounded(0, 3, (2,), dtype=torch.int64), CONTINUOUS, id="whole numbers"),
         pytest.param(
             Bounded(-1, torch.tensor([[1.0, 1.0], [1.0, 2.0]]), (2, 2)),
-            "expected the same bounds for all batch elements.*action_spec_unbatched",
+            "expected that of one state's action.*action_spec_unbatched",
             id="different in a batch",
         ),
+        pytest.param(Bounded(-1, 1.0, (64, 2)), "expected that of one state", id="batched"),
     ],
 )
 def test_specs_without_such_a_box_are_refused(spec: TensorSpec, message: str) -> None:
     with pytest.raises(ValueError, match=f"spec of 'action': {message}"):
         action_bounds(spec)
     with pytest.raises(ValueError, match=f"spec of 'action': {message}"):
-        make_constrained_actor(nn.Identity(), spec, [])
+        make_constrained_actor(nn.Identity(), spec=spec, bijectors=[])
 
 
 def test_views_and_composition_keep_options(make_actor: MakeActor) -> None:

@@ -17,7 +17,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, SoftUpdate, TD3Loss
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import (
     FlowMap,
     MissingGeometryError,
@@ -107,7 +106,7 @@ def test_keys_and_options_of_the_actor_are_kept(
     env: TransformedEnv, state: TensorDictBase, make_tanh_actor: Callable[..., Any]
 ) -> None:
     drawn = make_tanh_actor(num_samples=3, default_interaction_type=InteractionType.RANDOM)
-    actor = constrain(drawn, *constraint_bijectors(env))
+    actor = constrain(drawn, env)
     policy, base = split_at_latent(actor, latent_key=("inner", "z"), log_prob_key="score")
     with torch.no_grad():
         steps = policy(state.copy())
@@ -117,7 +116,7 @@ def test_keys_and_options_of_the_actor_are_kept(
     assert base.log_prob_keys == ["score"]
 
     default = InteractionType.DETERMINISTIC
-    actor = constrain(make_tanh_actor(default_interaction_type=default), *constraint_bijectors(env))
+    actor = constrain(make_tanh_actor(default_interaction_type=default), env)
     steps = split_at_latent(actor).policy(state.copy())
     torch.testing.assert_close(steps["latent"], steps["loc"])
 

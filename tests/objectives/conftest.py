@@ -8,7 +8,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ValueOperator
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -27,10 +26,7 @@ def env() -> TransformedEnv:
 @pytest.fixture
 def make_actor(env: TransformedEnv) -> MakeActor:
     def make(**options: Any) -> Any:
-        spec, bijectors = env.action_spec_unbatched, constraint_bijectors(env)
-        return make_constrained_actor(
-            gaussian_network(5, 2, hidden=[8]), spec, bijectors, **options
-        )
+        return make_constrained_actor(gaussian_network(5, 2, hidden=[8]), env, **options)
 
     return make
 

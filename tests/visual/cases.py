@@ -85,8 +85,8 @@ def make_actor(
         Gaussian(
             torch.zeros(dim) if loc is None else loc, torch.ones(dim) if scale is None else scale
         ),
-        Bounded(-torch.ones(dim), torch.ones(dim)),
-        [ConstraintBijector(name, type(each)) for name, each in sets.items()],
+        spec=Bounded(-torch.ones(dim), torch.ones(dim)),
+        bijectors=[ConstraintBijector(name, type(each)) for name, each in sets.items()],
         flow=flow,
     )
 

@@ -28,7 +28,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs import GeometryTransform
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, GeometryError
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import (

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+# Pillow is imported where it draws: the environment without pictures does not need it.
 
 # The palette of Okabe and Ito, which stays distinguishable with any color vision.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -43,6 +48,8 @@ def render_point_nav(
     Returns:
         uint8, ``(size, size, 3)``.
     """
+    from PIL import Image
+
     canvas = _Canvas(layout, size, _background(layout, size).copy())
     canvas.disc(goal, layout.goal_radius, fill="#FBE7BF", outline=ORANGE)
     canvas.disc(goal, 0.3 * layout.goal_radius, fill=ORANGE)
@@ -55,6 +62,8 @@ def render_point_nav(
 
 @lru_cache(maxsize=8)
 def _background(layout: Layout, size: int) -> Image.Image:
+    from PIL import Image
+
     side = size * _SUPERSAMPLING
     canvas = _Canvas(layout, size, Image.new("RGB", (side, side), FLOOR))
     for station in layout.stations:
@@ -71,6 +80,8 @@ class _Canvas:
     """Draws in arena units on an oversized picture; the map above, the battery bar below."""
 
     def __init__(self, layout: Layout, size: int, image: Image.Image) -> None:
+        from PIL import ImageDraw
+
         self.image = image
         self.wall = layout.wall
         self.unit = size * _SUPERSAMPLING / _SIZE
@@ -117,6 +128,8 @@ class _Canvas:
             self._draw.line(ends, shade, round(2 * self.unit))
 
     def battery(self, percent: int, threshold: int) -> None:
+        from PIL import ImageFont
+
         u = self.unit
         left, right, top, bottom = 100 * u, 412 * u, 470 * u, 488 * u
         scale = (right - left) / BATTERY_FULL

@@ -97,13 +97,13 @@ class FlowScene:
                 "actor: expected a flow with a density, such as flow=exact, given "
                 f"{type(head.flow).__name__}, whose stages have none to draw"
             )
-        dim = int(head.low.shape[-1])
+        dim = head.action_dim
         moves = head.flow.reads_constraints and not head.flow.is_safe
         return cls(
             stages=tuple(head.stage_names),
             constraints=tuple(head.order),
-            low=tuple(head.low.tolist()),
-            high=tuple(head.high.tolist()),
+            low=tuple(head.bounds.low.tolist()),
+            high=tuple(head.bounds.high.tolist()),
             projections=_projections(dim, projections),
             layout=None if env is None else layout_of(env),
             costs=_cost_names(env),

@@ -10,7 +10,6 @@ import rerun as rr
 import torch
 from tensordict import TensorDict
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -106,11 +105,7 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
         order=["battery", "obstacle"],
         with_anchor=True,
     )
-    actor = make_constrained_actor(
-        Gaussian(torch.zeros(2), torch.ones(2)),
-        env.action_spec_unbatched,
-        constraint_bijectors(env),
-    )
+    actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     start = env.reset(position=(-0.5, 0.6), battery=30)
     rollout = env.rollout(7, actor, tensordict=start, auto_reset=False, break_when_any_done=False)[
         1

@@ -11,7 +11,6 @@ import rerun as rr
 import torch
 from rerun.experimental import ViewerClient, ViewerState
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -89,11 +88,7 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
         order=["battery", "obstacle"],
         with_anchor=True,
     )
-    actor = make_constrained_actor(
-        Gaussian(torch.zeros(2), torch.ones(2)),
-        env.action_spec_unbatched,
-        constraint_bijectors(env),
-    )
+    actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     rollout = env.rollout(STEPS, actor)[0]
 
     def write(stream: rr.RecordingStream) -> None:

@@ -12,7 +12,6 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
@@ -28,11 +27,7 @@ def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorD
         order=["battery", "obstacle"],
         with_anchor=True,
     )
-    actor = make_constrained_actor(
-        Gaussian(torch.zeros(2), torch.ones(2)),
-        env.action_spec_unbatched,
-        constraint_bijectors(env),
-    )
+    actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     return env, actor
 
 

@@ -1,0 +1,59 @@
+"""One call that lets an environment publish its constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.modules import ConstraintPublisher, appended_transforms, constraint_bijectors
+
+_EXAMPLE = "write constrain_env(env, BatteryGeometry(), ObstacleGeometry())"
+
+
+def constrain_env(
+    env: EnvBase, *geometries: GeometryTransform, order: Sequence[str] | None = None
+) -> TransformedEnv:
+    """Let an environment publish what each state allows: geometries, anchor and active flags.
+
+    The counterpart of `cnfp_torchrl.constrain`, which makes an actor heed them: it takes the
+    constraints, their order and the action bounds from the environment that this returns.
+
+    Constraints that the environment publishes already come first, with lower priority.
+
+    Args:
+        env: An environment with a bounded action spec; not changed.
+        geometries: One transform for each constraint.
+        order: The constraints' names in order of application, the last with the highest priority
+            (lexicographic priority); None takes the order of the geometries.
+
+    Raises:
+        TypeError: when the environment or a geometry is none, such as a class or a list, or when
+            the order is a string.
+        ValueError: without geometries, or when an order does not name each constraint once.
+    """
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env: expected a TorchRL environment, given {_kind(env)}; wrap one of Gymnasium's in "
+            "torchrl.envs.GymWrapper"
+        )
+    if not geometries:
+        raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
+    for each in geometries:
+        if not isinstance(each, GeometryTransform):
+            raise TypeError(
+                f"geometries: expected each to be a GeometryTransform, given {_kind(each)}; "
+                f"{_EXAMPLE}"
+            )
+    known = any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
+    before = constraint_bijectors(env) if known else []
+    published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
+    _ = published.observation_spec  # calls each geometry for its first set
+    bijectors = [*before, *(own for each in geometries for own in each.bijectors)]
+    return published.append_transform(ConstraintAnchor(bijectors, order))
+
+
+def _kind(given: object) -> str:
+    return f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__

@@ -1,0 +1,110 @@
+"""Keys of the tensordict, and how to ask for an entry that may be missing.
+
+The tree of one step, for an environment of `constrain_env` with batch shape ``*batch``, K
+constraints and actions of d components::
+
+    observation                          the environment's own, with reward and done under next
+    constraints/
+        NAME/                            one for each constraint, by its GeometryTransform:
+            FIELD    (*batch, *event)        the set's fields, such as center and radius of a Ball
+            active   (*batch,) bool          whether the set holds as stated, by ConstraintAnchor
+        safe_action  (*batch, d)         a candidate for the anchor, where a geometry knows one
+        anchor       (*batch, d)         the point that gauges are taken about, by ConstraintAnchor
+    loc, scale       (*batch, d)         the Gaussian's parameters, by the network
+    latent           (*batch, d)         what was drawn from it, where `split_at_latent` keeps it
+    latent_log_prob  (*batch,)
+    action           (*batch, d)         allowed in this state, by the flow
+    action_log_prob  (*batch,)           where the actor returns it
+    episode_cost     (*batch, K)         violations so far in the episode, by ConstraintCost
+    next/                                the state that the action led to, with the same entries,
+        cost           (*batch, K)       violations of the action, by the environment's judge
+        raw_reward     (*batch, 1)       the reward without the penalty, by RewardPenalty
+"""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+CONSTRAINTS_KEY = "constraints"
+"""Where geometry stands: ``("constraints", NAME, FIELD)``."""
+
+ANCHOR_KEY = (CONSTRAINTS_KEY, "anchor")
+"""The point strictly inside all active sets that gauges are taken about, ``(*batch, d)``."""
+
+SAFE_ACTION_KEY = (CONSTRAINTS_KEY, "safe_action")
+"""A candidate for the anchor: an action that a geometry believes to be safe, ``(*batch, d)``."""
+
+RESERVED_NAMES = (ANCHOR_KEY[-1], SAFE_ACTION_KEY[-1])
+"""What stands beside the constraints, and therefore names none of them."""
+
+LOC_KEY = "loc"
+SCALE_KEY = "scale"
+ACTION_KEY = "action"
+LOG_DET_KEY = "log_det"
+LATENT_KEY = "latent"
+LATENT_LOG_PROB_KEY = "latent_log_prob"
+
+COST_KEY = "cost"
+"""Violations of one step, float32 ``(*batch, K)``; columns named by ``constraint_names``."""
+
+EPISODE_COST_KEY = "episode_cost"
+"""The sum of the costs of an episode so far, float32 ``(*batch, K)``."""
+
+REWARD_KEY = "reward"
+RAW_REWARD_KEY = "raw_reward"
+"""Where `cnfp_torchrl.envs.RewardPenalty` keeps the environment's own reward."""
+
+
+def field_key(constraint: str, field: str) -> tuple[str, str, str]:
+    """Return where a field of a constraint's set stands."""
+    return (CONSTRAINTS_KEY, constraint, field)
+
+
+def active_key(constraint: str) -> tuple[str, str, str]:
+    """Return where it stands whether a constraint's set holds in a state as stated."""
+    return field_key(constraint, "active")
+
+
+class MissingGeometryError(KeyError):
+    """A tensordict lacks an entry that a constraint needs; names the key and what publishes it."""
+
+    def __str__(self) -> str:
+        # KeyError shows the repr of its message, with every quote escaped.
+        return str(self.args[0])
+
+
+def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
+    """Return an entry of a tensordict, or say how to get it there.
+
+    Args:
+        tensordict: The tensordict to read.
+        key: The entry's key.
+        remedy: An instruction for whoever finds it missing.
+
+    Raises:
+        MissingGeometryError: when it is missing.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        found = sorted(map(str, tensordict.keys(True, True)))
+        raise MissingGeometryError(f"expected {key}, found keys {found}; {remedy}")
+    return value
+
+
+def refuse_string(argument: str, given: object) -> None:
+    """Refuse a string where a sequence of keys or names is expected: it would be split in letters.
+
+    Args:
+        argument: The argument's name, for the message.
+        given: The value that was passed.
+
+    Raises:
+        TypeError: naming the argument and what to write instead.
+    """
+    if isinstance(given, str):
+        raise TypeError(
+            f"{argument}: expected a sequence of names, given the string {given!r}; write "
+            f"{argument}=[{given!r}]"
+        )

@@ -1,0 +1,77 @@
+"""The constraints that an environment publishes, as its transforms tell them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
+
+
+class ConstraintPublisher(ABC):
+    """A transform of an environment that publishes constraints, and tells which.
+
+    Implemented by the transforms of `cnfp_torchrl.envs`.
+    """
+
+    states_order: ClassVar[bool] = False
+    """Whether the list is of all constraints, in their order of application."""
+
+    @property
+    @abstractmethod
+    def bijectors(self) -> list[ConstraintBijector]:
+        """One for each constraint that the transform publishes."""
+
+
+def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
+    """Return a bijector for each constraint that an environment publishes.
+
+    They come in order of application, that of the environment's `ConstraintAnchor`, or without one
+    that of its geometry transforms.
+
+    Args:
+        env: An environment such as `constrain_env` returns; one, no batch of them in workers.
+
+    Raises:
+        ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out.
+    """
+    publishers = [
+        each for each in appended_transforms(env) if isinstance(each, ConstraintPublisher)
+    ]
+    if publishers:
+        _ = env.observation_spec  # made once, when each constraint is called for its first set
+    ordered = [each for each in publishers if each.states_order]
+    published = [b for each in publishers if not each.states_order for b in each.bijectors]
+    bijectors = ordered[-1].bijectors if ordered else published
+    if not bijectors:
+        raise ValueError(
+            f"env: expected one that publishes at least one constraint, given "
+            f"{type(env).__name__} without a GeometryTransform of its own; make it with "
+            "constrain_env, and before batching: the transforms in the workers of a SerialEnv or "
+            "ParallelEnv are out of reach, so call this on one of the environments it is made of"
+        )
+    known = {each.name for each in bijectors}
+    if left_out := [each.name for each in published if each.name not in known]:
+        raise ValueError(
+            f"env: expected its ConstraintAnchor to know all constraints, given one with "
+            f"{sorted(known)} that leaves out {left_out}; pass all geometries to one constrain_env"
+        )
+    return bijectors
+
+
+def appended_transforms(env: EnvBase) -> list[Transform]:
+    """Return the transforms of an environment in order, none if it has none.
+
+    Those in the workers of a batched environment are not among them.
+    """
+    if not isinstance(env, TransformedEnv):
+        return []
+    return [*appended_transforms(env.base_env), *_flat(env.transform)]
+
+
+def _flat(transform: Transform) -> list[Transform]:
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [part for each in transform for part in _flat(each)]

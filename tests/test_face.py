@@ -1,0 +1,67 @@
+"""The face of the package: what it offers, what it costs, and that nobody goes round it."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import cnfp_torchrl
+
+PACKAGE = Path(cnfp_torchrl.__file__).parent
+CORE = ["keys", "geometry", "bijectors", "distributions", "modules", "envs"]
+OF_EXTRAS = {
+    "PIL",
+    "hydra",
+    "matplotlib",
+    "omegaconf",
+    "psutil",
+    "pyarrow",
+    "rerun",
+    "tensorboard",
+    "tqdm",
+    "yaml",
+}
+# What our dependencies bring by themselves is none of our doing.
+DEPENDENCIES = "gymnasium, numpy, tensordict.nn, torch, torchrl.data, torchrl.envs, torchrl.modules"
+
+
+def imported(statement: str) -> set[str]:
+    """Return the packages that a fresh process has after our dependencies and a statement."""
+    code = f"import sys, {DEPENDENCIES}\n{statement}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in done.stdout.split()}
+
+
+def test_the_face_has_what_most_users_need_and_nothing_else() -> None:
+    public = {name for name in cnfp_torchrl.__all__ if name != "__version__"}
+    assert {"constrain", "constrain_env", "make_constrained_actor"} <= public
+    assert {"GeometryTransform", "ConstrainedFlow", "ActionGuard", "SafeRandomPolicy"} <= public
+    from cnfp_torchrl import geometry
+
+    families = {
+        name
+        for name, each in vars(geometry).items()
+        if isinstance(each, type) and issubclass(each, geometry.ConstraintSet)
+    }
+    assert {"Ball", "Box", "HalfSpaces", "WeightedL1Ball"} <= families & public
+    for name in public:
+        assert getattr(cnfp_torchrl, name).__doc__, name
+
+
+def test_the_core_brings_in_no_package_of_an_extra() -> None:
+    rooms = ", ".join(f"cnfp_torchrl.{room}" for room in CORE)
+    task = "from cnfp_torchrl.tasks.point_nav import PointNavEnv, BatteryGeometry"
+    brought = imported(f"import cnfp_torchrl, {rooms}\n{task}") - imported("")
+    assert not brought & OF_EXTRAS
+
+
+def test_no_file_imports_private_names() -> None:
+    private = [
+        f"{file.name}: {node.module}.{alias.name}"
+        for file in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("cnfp_torchrl")
+        for alias in node.names
+        if alias.name.startswith("_") or "._" in (node.module or "")
+    ]
+    assert not private
