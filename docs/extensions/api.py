@@ -67,12 +67,11 @@ def _room_page(room: str) -> str:
     """Return the room's docstring, a table of its names, and the pages of those at home here."""
     full_names = [home(room, name) for name in names_in(rooms()[room])]
     own = [name for name in full_names if name.rpartition(".")[0] == room]
-    # Names of the room itself stand without it, as autosummary wants them.
-    table = "\n".join(f"   {name.removeprefix(f'{room}.')}" for name in own)
-    others = "\n".join(f"   ~{name}" for name in full_names if name not in own)
+    # Autosummary wants names without the module that it stands in.
+    table = "\n".join(f"   ~{name.removeprefix(f'{room}.')}" for name in full_names)
     return (
         f"{_title(room)}.. automodule:: {room}\n   :no-members:\n\n"
-        f".. autosummary::\n   :nosignatures:\n\n{table}\n{others}\n\n"
+        f".. autosummary::\n   :nosignatures:\n\n{table}\n\n"
         + (".. toctree::\n   :hidden:\n\n" + "\n".join(f"   {name}" for name in own) if own else "")
         + "\n"
     )
