@@ -123,7 +123,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     @property
     def stage_names(self) -> list[str]:
-        """Names of the stages of `get_dist(...).stages`, in order of application."""
+        """Names of the stages of ``get_dist(...).stages``, in order of application."""
         if self.flow.is_safe:
             return ["bounds", *self.order]
         return self.order if self.flow.reads_constraints and self.order else ["bounds"]

@@ -11,7 +11,7 @@ import pytest
 from cnfp_torchrl.visual import run_figures
 from tests.entry_points import load_command
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "own_environment.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "own_environment.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
 MODULE, CONFIG = Path("my_pendulum.py"), Path("conf/env/my_pendulum.yaml")
 SHORTER = {

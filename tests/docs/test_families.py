@@ -14,7 +14,7 @@ from cnfp_torchrl.geometry import HalfSpaces
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.testing import FamilyError, check_constraint_set
 
-GUIDE = (Path(__file__).resolve().parents[1] / "docs" / "families.md").read_text()
+GUIDE = (Path(__file__).resolve().parents[2] / "docs" / "families.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", GUIDE, flags=re.DOTALL)
 
 
