@@ -41,7 +41,8 @@ class WarmUpPolicy(TensorDictModuleBase):
 
     Takes the place of a collector's ``init_random_frames``, whose actions are not constrained. A
     collector tries its policy once when it is made, which counts as one action of each batch
-    element; to begin anew, set `frames_left`. Each process of a distributed collector counts alone.
+    element; to begin anew, set ``frames_left``. Each process of a distributed collector counts
+    alone.
 
     Args:
         actor: A constrained actor.
