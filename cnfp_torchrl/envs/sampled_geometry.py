@@ -50,7 +50,7 @@ class SampledGeometry(Transform):
         parts = tensordict, tensordict.get("next")
         states = torch.stack([each.select(*self.state_keys) for each in parts])
         for geometry in self._geometries:
-            allowed = geometry.constraint_set(states)
+            allowed = geometry.checked_set(states)
             for field, value in allowed.fields().items():
                 event = value.shape[value.ndim - allowed.event_dims[field] :]
                 key = field_key(geometry.name, field)
