@@ -11,7 +11,7 @@ from torch.distributions import Distribution, Independent, Normal, TransformedDi
 from torch.distributions.utils import _standard_normal
 
 from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.geometry import broadcast_shape
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 

@@ -22,7 +22,6 @@ from cnfp_torchrl.audit.report import (
 )
 from cnfp_torchrl.audit.rollouts import Record
 from cnfp_torchrl.audit.trial import Trial, describe
-from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 
@@ -181,13 +180,7 @@ def worst_scene(trial: Trial, name: str, source: str) -> tuple[float, Scene]:
     here = trial.head.get_region(trial.states[s])
     tried = [x[:, s].cpu() for x in (trial.actions, inside, bad, dead_end)]
     entries = trial.described(s)["state"]
-    return float(against[s]), Scene(name, source, why, entries, _on_host(here), *tried)
-
-
-def _on_host(region: Region) -> Region:
-    sets = tuple(each.with_fields(lambda value, _: value.cpu()) for each in region.sets)
-    assert region.active is not None
-    return Region(sets, region.anchor.cpu(), region.active.cpu())
+    return float(against[s]), Scene(name, source, why, entries, here.to(device="cpu"), *tried)
 
 
 def executed(

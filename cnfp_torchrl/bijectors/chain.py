@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.geometry import broadcast_shape
 
 
 class SquashChain(Bijector):

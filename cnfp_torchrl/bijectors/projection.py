@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
-from cnfp_torchrl.bijectors.box_squash import BoxSquash
-from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
-from cnfp_torchrl.geometry import Region, project_onto_intersection
+from cnfp_torchrl.bijectors.squashes import BoxSquash
+from cnfp_torchrl.geometry import Region, project_onto_intersection, require_action_bounds
 
 
 class NoDensityError(NotImplementedError):
@@ -21,9 +20,9 @@ class Projection(Bijector):
     r"""Squash R^d into the action bounds, then take the closest point of the region.
 
     :math:`a = \arg\min_{a' \in S} |a' - \mathrm{BoxSquash}(z)|`, found by Dykstra's algorithm
-    (`cnfp_torchrl.geometry.project_onto_intersection`), then drawn towards the anchor as far as the
-    rounds of the algorithm did not suffice, so that every action satisfies every active constraint
-    with zero tolerance. Differentiable almost everywhere.
+    (`cnfp_torchrl.geometry.project_onto_intersection`), then pulled towards the anchor as far as
+    the rounds of the algorithm did not suffice, so that every action satisfies every active
+    constraint with zero tolerance. Differentiable almost everywhere.
 
     It stands where a bijector stands, but is none: everything outside the region lands on its
     boundary, whose points have positive probability and no density. Only the reference
@@ -47,19 +46,19 @@ class Projection(Bijector):
         if rounds < 1:
             raise ValueError(f"rounds: expected a number >= 1, given {rounds}")
         if validate_args:
-            region.bounds.validate()
+            require_action_bounds(region.bounds)
         self._allowed, self._region = region, region.eroded()
-        self._box = BoxSquash.onto(self._region.bounds, validate_args=validate_args)
+        self._box = BoxSquash.onto(self._region.bounds)
         self._rounds = rounds
 
     @property
     def shape(self) -> torch.Size:
-        return region_shape(self._region)
+        return self._region.shape
 
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         bounded, log_det = self._box.forward_and_log_det(latent)
         closest = project_onto_intersection(self._region, bounded, self._rounds)
-        return self._drawn_in(closest), log_det
+        return self._region.pulled_in(closest), log_det
 
     def contains(self, action: Tensor) -> Tensor:
         """Tell whether each action lies in the region, whose boundary is part of the image."""
@@ -76,16 +75,6 @@ class Projection(Bijector):
 
     def _call(self, x: Tensor) -> Tensor:
         return self.forward_and_reference_log_det(x)[0]
-
-    def _drawn_in(self, action: Tensor) -> Tensor:
-        anchor = self._region.anchor
-        offset = action - anchor
-        direction, zero = scaled_direction(offset)
-        length = offset.detach().abs().amax(-1)
-        # The gauge of the offset itself; above 1 where it ends outside.
-        gauge = self._region.gauges(direction)[-1] * length
-        share = torch.where(zero, 1.0, 1 / gauge.clamp(min=1))
-        return anchor + share.unsqueeze(-1) * offset
 
 
 def _no_density(wanted: str) -> NoDensityError:

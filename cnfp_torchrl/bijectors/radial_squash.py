@@ -6,11 +6,9 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.bijectors.ball_squash import squash_to_unit_ball
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
-from cnfp_torchrl.bijectors.hyperbolic import radial_log_det
-from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
-from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.bijectors.squashes import radial_log_det, squash_to_unit_ball
+from cnfp_torchrl.geometry import Region, require_action_bounds, scaled_direction
 
 
 class RadialSquash(Bijector):
@@ -24,15 +22,21 @@ class RadialSquash(Bijector):
 
     Args:
         region: sets, anchor and active flags, ``(*batch,)`` of them.
+        validate_args: whether to check the action bounds, which reads them on the host.
+
+    Raises:
+        GeometryError: when the action bounds are invalid.
     """
 
-    def __init__(self, region: Region) -> None:
+    def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
+        if validate_args:
+            require_action_bounds(region.bounds)
         self.region = region.eroded()
 
     @property
     def shape(self) -> torch.Size:
-        return region_shape(self.region)
+        return self.region.shape
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         direction, _ = scaled_direction(latent)

@@ -1,75 +1,93 @@
-"""A tanh squash into the action bounds, then retractions into a region: what exact flows share."""
+"""The exact flows: a tanh squash into the action bounds, then retractions into the allowed region.
+
+The retractions are a bijective form of alpha projection (Sanket et al. 2020, "Solving online threat
+screening games using constrained action space reinforcement learning"), which scales an action
+towards an interior point until it is allowed.
+"""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import threshold
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
-from cnfp_torchrl.bijectors.box_squash import BoxSquash
-from cnfp_torchrl.bijectors.component_scale import ComponentScale
-from cnfp_torchrl.bijectors.rays import Rays, region_shape
-from cnfp_torchrl.geometry import Box, ConstraintSet, Region
-from cnfp_torchrl.geometry.box import gauge_of_sides, sides
+from cnfp_torchrl.bijectors.squashes import BoxSquash
+from cnfp_torchrl.geometry import (
+    Box,
+    ConstraintSet,
+    Gauge,
+    Region,
+    gauge_of_sides,
+    require_action_bounds,
+    sides,
+)
 
 
-class RegionSquash(Bijector):
-    """Squash R^d exactly onto the intersection of all active sets of a region.
+class ExactSquash(Bijector):
+    r"""Squash R^d exactly onto the intersection of all active sets of a region.
 
-    A subclass says which of the sets are retracted component by component; the others are retracted
-    along rays from the anchor. The image is the region eroded by rounding error: saturated samples
-    satisfy every active constraint with zero tolerance.
+    Stage 0 is the box squash into the action bounds B, :math:`x = \mathrm{BoxSquash}(z)`. Let c be
+    the anchor, :math:`v = x - c`, and :math:`B_k` the intersection of B with the boxes among the
+    first k constraints. What boxes forbid is taken out in each component on its own,
+
+    .. math:: w_i = v_i\, \rho_i, \quad \rho_i = room_i(B_k) / room_i(B),
+
+    with :math:`room_i` the distance from c to the side that :math:`v_i` points to, and what the
+    other sets forbid along the ray: with :math:`G_k` the gauge (Minkowski functional) of their
+    intersection with :math:`B_k`, :math:`a_k = c + w/r`, :math:`r = G_k(w)/g_{B_k}(w)`. At the last
+    stage :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| + \sum_i \log \rho_i - d \log r`.
+
+    A box beside the agent thus leaves the motion along it alone, which a retraction of the whole
+    vector (`GaugeSquash`) shortens with the motion towards it. Without boxes among the constraints
+    both are the same. The log-density jumps where a component of v changes its sign, and where
+    other sets bind it has no limit at the anchor (`docs/method.md`). The image is the region eroded
+    by rounding error: saturated samples satisfy every active constraint with zero tolerance.
 
     Args:
         region: sets, anchor and active flags, ``(*batch,)`` of them.
-        validate_args: check the action bounds, which reads them on the host.
+        validate_args: whether to check the action bounds, which reads them on the host.
 
     Raises:
         GeometryError: when the action bounds are invalid.
     """
 
+    scales_by_boxes: ClassVar[bool] = True
+    """Whether boxes are taken out component by component, or along the ray as other sets are."""
+
     def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
         if validate_args:
-            region.bounds.validate()
+            require_action_bounds(region.bounds)
         self.region = region.eroded()
         # All stages work in coordinates about the anchor, where the box squash and the gauges have
         # the same bounds in floating point. Were they a rounding error of the coordinates apart, a
         # gauge of 1 + e at the bounds would let samples overshoot by e times the distance to the
         # anchor, and near a bound one rounding error is a large e.
-        self._box = BoxSquash.onto(self.region.bounds, validate_args=validate_args).about(
-            region.anchor
-        )
+        self._squash = BoxSquash.onto(self.region.bounds).about(region.anchor)
         self._retraction = self._retraction_into(self.region.sets[1:])
-
-    @staticmethod
-    @abstractmethod
-    def boxes_and_others(
-        sets: Sequence[ConstraintSet],
-    ) -> tuple[Sequence[Box], Sequence[ConstraintSet]]:
-        """Split constraints into boxes to retract component by component, and all others."""
 
     @property
     def shape(self) -> torch.Size:
-        return region_shape(self.region)
+        return self.region.shape
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        return self._retraction.forward_and_log_det(*self._box.forward_and_log_slopes(latent))
+        return self._retraction.forward_and_log_det(*self._squash.forward_and_log_slopes(latent))
 
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        offset, log_det = self._box.forward_and_log_det(latent)
+        offset, log_det = self._squash.forward_and_log_det(latent)
         return self._retraction.forward(offset), log_det
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         offset, log_det = self._retraction.inverse_and_log_det(action)
-        latent, box_log_det = self._box.inverse_and_log_det(offset)
-        return latent, log_det + box_log_det
+        latent, squash_log_det = self._squash.inverse_and_log_det(offset)
+        return latent, log_det + squash_log_det
 
     def stages(self, latent: Tensor) -> Stages:
-        offset, log_slopes = self._box.forward_and_log_slopes(latent)
+        offset, log_slopes = self._squash.forward_and_log_slopes(latent)
         sets = self.region.sets
         # Each stage is the flow of the constraints so far.
         stages = [
@@ -83,8 +101,25 @@ class RegionSquash(Bijector):
         )
 
     def _retraction_into(self, sets: Sequence[ConstraintSet]) -> _Retraction:
-        boxes, others = self.boxes_and_others(sets)
-        return _Retraction(self._box.image, boxes, others, self.region.anchor)
+        boxes = [each for each in sets if self.scales_by_boxes and isinstance(each, Box)]
+        others = [each for each in sets if not (self.scales_by_boxes and isinstance(each, Box))]
+        return _Retraction(self._squash.image, boxes, others, self.region.anchor)
+
+
+class GaugeSquash(ExactSquash):
+    r"""Squash R^d exactly onto the intersection of all active sets of a region, along rays.
+
+    The exact flow with boxes retracted along the ray, as all other sets are: with :math:`v = x - c`
+    from stage 0, :math:`g_0` the gauge of the bounds and :math:`G_k` that of the region after k
+    constraints, :math:`a_k = c + v/r`, :math:`r = G_k(v)/g_0(v)`. At the last stage
+    :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| - d \log r`.
+
+    Where nothing binds, r = 1 and the action is that of a tanh-squashed Gaussian. The log-density
+    has no limit at the anchor, where its gradient grows like :math:`1/|v|` (`docs/method.md`). See
+    `ExactSquash` for the arguments.
+    """
+
+    scales_by_boxes = False
 
 
 class _Retraction:
@@ -97,12 +132,11 @@ class _Retraction:
         self._above, self._below = bounds.high.reciprocal(), -bounds.low.reciprocal()
         self._scale = None
         if boxes:
-            inner = bounds
+            low, high = bounds.low, bounds.high
             for box in boxes:
-                low = torch.maximum(inner.low, box.low - anchor)
-                high = torch.minimum(inner.high, box.high - anchor)
-                inner = Box(low, high, validate_args=False)
-            self._scale = ComponentScale.between(bounds, inner)
+                low = torch.maximum(low, box.low - anchor)
+                high = torch.minimum(high, box.high - anchor)
+            self._scale = _ComponentScale(high / bounds.high, low / bounds.low)
         self._inner = [each.gauge_about(anchor) for each in others]
 
     def forward(self, offset: Tensor) -> Tensor:
@@ -125,7 +159,7 @@ class _Retraction:
         return self._contracted(scaled, contraction), log_det
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the offset of an action, and the log-determinant of the way back to it."""
+        """Return the offset of an action, and the inverse's log-determinant up to there."""
         offset = action - self._anchor
         if self._scale is not None:
             offset = self._scale.inverse(offset)
@@ -140,16 +174,75 @@ class _Retraction:
         return offset, log_det
 
     def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the offset after the boxes, and by what it is to be divided for other sets."""
+        """Return the offset after the boxes, and the divisor r that other sets ask for."""
         ahead, behind = sides(offset)
         scaled = offset if self._scale is None else self._scale.forward(ahead, behind)
         if not self._inner:
             return scaled, None
-        progress = gauge_of_sides(self._above, self._below, ahead, behind)
-        return scaled, Rays(scaled, progress).contraction(self._inner)
+        outer_gauge = gauge_of_sides(self._above, self._below, ahead, behind)
+        return scaled, contraction_along_rays(scaled, outer_gauge, self._inner)
 
     def _contracted(self, scaled: Tensor, contraction: Tensor | None) -> Tensor:
         if contraction is None:
             return self._anchor + scaled
         # Not a quotient: its gradient takes more passes.
         return torch.addcmul(self._anchor, scaled, contraction.reciprocal().unsqueeze(-1))
+
+
+class _ComponentScale:
+    r"""The bijection :math:`v_i \mapsto v_i \rho_i`, with one factor for each sign of a component.
+
+    Args:
+        above: factors of positive components, ``(*batch, d)``, positive.
+        below: factors of negative components, ``(*batch, d)``, positive.
+    """
+
+    def __init__(self, above: Tensor, below: Tensor) -> None:
+        self._above, self._below = above, below
+        log_above, log_below = above.log(), below.log()
+        self._log_mean = torch.lerp(log_below, log_above, 0.5)
+        self._log_half_ratio = log_above - self._log_mean
+
+    def forward(self, ahead: Tensor, behind: Tensor) -> Tensor:
+        """Return the scaled offset ``(*batch, d)`` of an offset given by its `sides`."""
+        return torch.addcmul(ahead * self._above, behind, self._below, value=-1)
+
+    def inverse(self, scaled: Tensor) -> Tensor:
+        ahead, behind = sides(scaled)
+        return torch.addcdiv(ahead / self._above, behind, self._below, value=-1)
+
+    def log_slopes(self, offset: Tensor) -> Tensor:
+        r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
+        # Arithmetic with the sign, because masks are slow to make and to convert.
+        return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
+
+
+def contraction_along_rays(offset: Tensor, outer_gauge: Tensor, inner: Sequence[Gauge]) -> Tensor:
+    r"""Return the divisor r of an offset that ends in some inner sets too, ``(*batch,)``.
+
+    :math:`r = \max(1, \max_j g_j(v)/g_{outer}(v))`, and 1 for an offset of zero. Where no inner set
+    binds it is exactly 1, and its gradient 0. An inner gauge of NaN makes it NaN: a broken
+    constraint must not pass for one that does not bind.
+
+    Args:
+        offset: v, points of an outer set minus the anchor, ``(*batch, d)``.
+        outer_gauge: the outer set's gauge of the offset, ``(*batch,)``.
+        inner: the gauges of one or more inner sets about the anchor.
+    """
+    # In one dimension a direction is a sign and has no gradient; computed, its exact zero would be
+    # rounding error over the length.
+    if offset.shape[-1] == 1:
+        offset, outer_gauge = offset.detach(), outer_gauge.detach()
+    # An offset of zero has no direction, and one so short that gradients, which grow like 1/length,
+    # could overflow when squared, has none to speak of. It is given one, so that nothing becomes
+    # NaN, and a ray to the boundary on which no set binds.
+    shortest = torch.finfo(offset.dtype).tiny ** 0.4
+    direction = offset + (outer_gauge <= shortest).unsqueeze(-1)
+    gauges = [gauge(direction) for gauge in inner]
+    if len(gauges) == 1:
+        largest = gauges[0]
+    else:
+        # Not one maximum after the other: each gradient costs as much as that of all at once.
+        largest = torch.stack(torch.broadcast_tensors(*gauges)).amax(0)
+    # The larger one of it and 1; the gradient of clamp takes more passes.
+    return threshold(largest / threshold(outer_gauge, shortest, torch.inf), 1, 1)

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.rays import Rays
-from cnfp_torchrl.geometry import ConstraintSet
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.bijectors.region_squash import contraction_along_rays
+from cnfp_torchrl.geometry import Box, ConstraintSet, broadcast_shape
 
 
 class Retraction(Bijector):
@@ -27,7 +26,7 @@ class Retraction(Bijector):
 
     def __init__(self, outer: ConstraintSet, inner: ConstraintSet, anchor: Tensor) -> None:
         super().__init__()
-        inner = inner.eroded(outer.bounding_box().magnitude())
+        inner = inner.eroded(Box(*outer.bounding_box(), validate_args=False).magnitude())
         self._outer, self._inner, self._anchor = outer, inner, anchor
         self._outer_gauge = outer.gauge_about(anchor)
         self._inner_gauge = inner.gauge_about(anchor)
@@ -55,4 +54,4 @@ class Retraction(Bijector):
 
     def _progress_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor]:
         progress = self._outer_gauge(offset)
-        return progress, Rays(offset, progress).contraction([self._inner_gauge])
+        return progress, contraction_along_rays(offset, progress, [self._inner_gauge])

@@ -7,11 +7,16 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.hyperbolic import log_sech_squared
-from cnfp_torchrl.bijectors.rays import region_shape, scaled_direction
-from cnfp_torchrl.geometry import GeometryError, Region
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS
-from cnfp_torchrl.geometry.shapes import broadcast_shape
+from cnfp_torchrl.bijectors.squashes import log_sech_squared
+from cnfp_torchrl.geometry import (
+    EROSION_IN_EPS,
+    GeometryError,
+    Region,
+    broadcast_shape,
+    length,
+    require_action_bounds,
+    scaled_direction,
+)
 
 
 class ShellSquash(Bijector):
@@ -56,17 +61,19 @@ class ShellSquash(Bijector):
                 f"ShellSquash: expected 0 < inner < outer, not closer than {center.dtype} can tell "
                 f"apart, given inner {inner.tolist()}, outer {outer.tolist()}"
             )
+        if validate_args and region is not None:
+            require_action_bounds(region.bounds)
         self._region = None if region is None else region.eroded()
 
     @property
     def shape(self) -> torch.Size:
-        region = () if self._region is None else (region_shape(self._region)[:-1],)
+        region = () if self._region is None else (self._region.shape[:-1],)
         batch = broadcast_shape(self._center.shape[:-1], self._inner.shape, *region)
         return torch.Size((*batch, self._center.shape[-1]))
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         direction, unit_length, width = self._rays(latent)
-        rho = vector_norm(latent, dim=-1)
+        rho = length(latent)
         radius = self._inner + width * rho.tanh()
         action = self._center + direction * (radius / unit_length).unsqueeze(-1)
         return action, self._log_det(rho, radius, width, latent.shape[-1])
@@ -84,14 +91,14 @@ class ShellSquash(Bijector):
     def _rays(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return direction, its length, and the width of the shell along it."""
         direction, _ = scaled_direction(offset)
-        length = vector_norm(direction, dim=-1)
+        unit_length = vector_norm(direction, dim=-1)
         outer = self._outer
         if self._region is not None:
             _, gauge = self._region.outer_and_inner_gauge(direction)
-            outer = torch.minimum(outer, length / gauge)
+            outer = torch.minimum(outer, unit_length / gauge)
         width = outer - self._inner
         # A ray on which the region ends inside the hole has no allowed action: say so, loudly.
-        return direction, length, torch.where(width > 0, width, torch.nan)
+        return direction, unit_length, torch.where(width > 0, width, torch.nan)
 
     @staticmethod
     def _log_det(rho: Tensor, radius: Tensor, width: Tensor, dim: int) -> Tensor:

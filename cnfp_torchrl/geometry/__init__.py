@@ -1,28 +1,35 @@
 """Sets of allowed actions and their intersections: containment, slack, gauges, anchors."""
 
 from cnfp_torchrl.geometry.anchors import MINIMUM_SLACK, chebyshev_center, lexicographic_anchor
-from cnfp_torchrl.geometry.ball import Ball
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, GeometryError
-from cnfp_torchrl.geometry.ellipsoid import Ellipsoid
+from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
+from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    GeometryError,
+    broadcast_shape,
+    largest_value,
+)
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
-from cnfp_torchrl.geometry.positive_part import PositivePart
+from cnfp_torchrl.geometry.norms import length, power_of_two
 from cnfp_torchrl.geometry.projection import project, project_onto_intersection
-from cnfp_torchrl.geometry.region import Region
+from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
-from cnfp_torchrl.geometry.task_space_ball import TaskSpaceBall
-from cnfp_torchrl.geometry.visible_or_box import VisibleOrBox
-from cnfp_torchrl.geometry.visible_region import VisibleRegion
-from cnfp_torchrl.geometry.weighted_l1_ball import WeightedL1Ball
+from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
+from cnfp_torchrl.geometry.weighted_sums import PositivePart, WeightedL1Ball
 
 __all__ = [
     "EROSION_IN_EPS",
     "MINIMUM_SLACK",
     "Ball",
+    "Bounds",
     "Box",
     "Cone",
     "ConstraintSet",
     "Ellipsoid",
+    "Gauge",
     "GeometryError",
     "HalfSpaces",
     "KinkedSum",
@@ -34,8 +41,16 @@ __all__ = [
     "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
+    "broadcast_shape",
     "chebyshev_center",
+    "gauge_of_sides",
+    "largest_value",
+    "length",
     "lexicographic_anchor",
+    "power_of_two",
     "project",
     "project_onto_intersection",
+    "require_action_bounds",
+    "scaled_direction",
+    "sides",
 ]

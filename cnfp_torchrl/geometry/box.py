@@ -10,8 +10,17 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    GeometryError,
+)
 from cnfp_torchrl.geometry.superlevel import Rows
+
+ACTION_RANGE = {torch.float32: (1e-7, 1e18), torch.float64: (1e-30, 1e150)}
+"""The least width and the largest number of action bounds, by dtype: flows square actions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +53,8 @@ class Box(ConstraintSet):
         above, below = self.high - anchor, anchor - self.low
         return partial(_gauge, above.reciprocal(), below.reciprocal())
 
-    def bounding_box(self) -> Box:
-        return self
+    def bounding_box(self) -> Bounds:
+        return Bounds(self.low, self.high)
 
     def magnitude(self) -> Tensor:
         """Return the largest coordinate of any point, ``(*batch,)``."""
@@ -76,6 +85,47 @@ class Box(ConstraintSet):
         low, high = torch.broadcast_tensors(self.low, self.high)
         offsets = torch.cat([high, -low], -1)
         return Rows(torch.cat([identity, -identity]), offsets, torch.ones_like(offsets))
+
+
+def require_action_bounds(bounds: Box, where: str = "action bounds") -> Box:
+    """Return the action bounds, stage 0 of every flow, or refuse them.
+
+    Reads them on the host.
+
+    Args:
+        bounds: the box of all actions.
+        where: the beginning of the message.
+
+    Raises:
+        GeometryError: when a bound is not finite, bounds are closer than rounding error lets a flow
+            fill, or too close or too far apart for squares in their dtype.
+    """
+    bounds.validate_shapes(where)
+    low, high = torch.broadcast_tensors(bounds.low, bounds.high)
+    width, rounding = high - low, EROSION_IN_EPS * torch.finfo(bounds.dtype).eps
+    least, most = ACTION_RANGE[bounds.dtype]
+    for bad, expected in (
+        (~(low.isfinite() & high.isfinite()), "finite bounds; use an open box as a constraint"),
+        (low >= high, "low < high"),
+        # Erosion takes twice the rounding error on both sides: half of the room must be left.
+        (
+            width < 8 * rounding * torch.maximum(low.abs(), high.abs()),
+            f"bounds further apart than rounding error in {bounds.dtype}; shift them, or convert "
+            "them to float64",
+        ),
+        (
+            (width < least) | (torch.maximum(low.abs(), high.abs()) > most),
+            f"bounds in {bounds.dtype} at least {least:g} apart and of at most {most:g}; scale the "
+            "actions",
+        ),
+    ):
+        if bool(bad.any()):
+            index = tuple(bad.nonzero()[0].tolist())
+            raise GeometryError(
+                f"{where}: expected {expected}, given low {low[index].item()} and high "
+                f"{high[index].item()} at index {list(index)}"
+            )
+    return bounds
 
 
 def sides(offset: Tensor) -> tuple[Tensor, Tensor]:

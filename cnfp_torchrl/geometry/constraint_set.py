@@ -7,22 +7,47 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import InitVar, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Self, TypeAlias
+from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.shapes import broadcast_shape
 from cnfp_torchrl.geometry.superlevel import Superlevel
-
-if TYPE_CHECKING:
-    from cnfp_torchrl.geometry.box import Box
 
 EROSION_IN_EPS = 16.0
 """How many units of rounding error `ConstraintSet.eroded` moves a boundary inwards."""
 
 Gauge: TypeAlias = Callable[[Tensor], Tensor]
 """The gauge of a set about an anchor: directions ``(*batch, d)`` to values ``(*batch,)``."""
+
+
+def broadcast_shape(*shapes: torch.Size) -> torch.Size:
+    """Return the shape that shapes broadcast to, at once where they are equal or empty."""
+    known = [shape for shape in shapes if len(shape)]
+    if all(shape == known[0] for shape in known):
+        return known[0] if known else torch.Size()
+    return torch.broadcast_shapes(*known)
+
+
+def largest_value(dtype: torch.dtype) -> float:
+    """Return the largest finite number that a field may hold: 1e33 in float32, 1e150 in float64.
+
+    Sums of many stay finite, and so do their squares in the search for anchors, which is done in
+    float64.
+    """
+    return 1e33 if dtype == torch.float32 else 1e150
+
+
+class Bounds(NamedTuple):
+    """Lower and upper bounds of the components of actions.
+
+    Args:
+        low: lower bounds ``(*batch, d)``, minus infinity where none is known.
+        high: upper bounds ``(*batch, d)``, infinity where none is known.
+    """
+
+    low: Tensor
+    high: Tensor
 
 
 class GeometryError(ValueError):
@@ -122,13 +147,11 @@ class ConstraintSet(ABC):
         """
         return self.to(torch.float64).slack(action.double()) >= 0
 
-    def bounding_box(self) -> Box:
-        """Return a box around the set; its bounds are infinite where none are known."""
-        from cnfp_torchrl.geometry.box import Box
-
+    def bounding_box(self) -> Bounds:
+        """Return bounds of the set's actions, infinite where none are known."""
         like = next(iter(self.fields().values()))
         high = torch.full((self.dim,), torch.inf, dtype=like.dtype, device=like.device)
-        return Box(-high, high, validate_args=False)
+        return Bounds(-high, high)
 
     def superlevel(self) -> Superlevel | None:
         """Describe the actions with a slack of at least t, for the search for anchors.
@@ -171,12 +194,16 @@ class ConstraintSet(ABC):
         """The floating type of the fields."""
         return getattr(self, next(iter(self.event_dims))).dtype
 
-    def to(self, dtype: torch.dtype) -> Self:
-        """Return the set with all fields converted to a dtype, itself where they have it.
+    def to(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Self:
+        """Return the set with all fields in a dtype, on a device; itself where they are already.
 
         Rounding the fields moves the boundary by less than `eroded` does.
         """
-        return self if self.dtype == dtype else self.with_fields(lambda field, _: field.to(dtype))
+        if device is None and dtype in (None, self.dtype):
+            return self
+        return self.with_fields(lambda field, _: field.to(device, dtype))
 
     def with_fields(self, change: Callable[[Tensor, int], Tensor]) -> Self:
         """Return the set with each field replaced by a function of it and its event dimensions."""
@@ -227,6 +254,9 @@ class ConstraintSet(ABC):
         self.validate_shapes(where)
         for field, value in self.fields().items():
             self._refuse(where, field, torch.isnan(value), "a number")
+            most = largest_value(self.dtype)
+            huge = (value.abs() > most) & value.isfinite()
+            self._refuse(where, field, huge, f"numbers up to {most:g}, the range of {self.dtype}")
         for field, bad, expected in self.invalid_fields():
             self._refuse(where, field, bad, expected)
         return self

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.norms import power_of_two
 from cnfp_torchrl.geometry.superlevel import Rows
 
 
@@ -49,33 +49,36 @@ class HalfSpaces(ConstraintSet):
         return frozenset({"offsets"})
 
     def contains(self, action: Tensor) -> Tensor:
-        return (_rows(self.normals.double(), action.double()) <= self.offsets.double()).all(-1)
+        sets = self.to(torch.float64)._normalized()
+        return (_rows(sets.normals, action.double()) <= sets.offsets).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
-        offsets, lengths = self._offsets_and_lengths()
-        return ((offsets - _rows(self.normals, action)) / lengths).amin(-1)
+        rows = self.superlevel()
+        return ((rows.offsets - _rows(rows.normals, action)) / rows.rates).amin(-1)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        room = self._offsets_and_lengths()[0] - _rows(self.normals, anchor)
-        return partial(_gauge, self.normals, room.reciprocal())
+        rows = self.superlevel()
+        room = rows.offsets - _rows(rows.normals, anchor)
+        return partial(_gauge, rows.normals, room.reciprocal())
 
-    def bounding_box(self) -> Box:
+    def bounding_box(self) -> Bounds:
         """Return the bounds that single rows with one component set; the others are infinite."""
         single = (self.normals != 0).sum(-1, keepdim=True) == 1
         bound = self.offsets.unsqueeze(-1) / self.normals
         high = torch.where(single & (self.normals > 0), bound, torch.inf).amin(-2)
         low = torch.where(single & (self.normals < 0), bound, -torch.inf).amax(-2)
-        return Box(low, high, validate_args=False)
+        return Bounds(low, high)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
-        size = self.normals.abs().sum(-1) * largest.unsqueeze(-1) + self.offsets.abs()
-        offsets = torch.where(self.offsets.isinf(), self.offsets, self.offsets - eps * size)
-        return type(self)(self.normals, offsets, validate_args=False)
+        sets = self._normalized()
+        size = sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
+        offsets = torch.where(sets.offsets.isinf(), sets.offsets, sets.offsets - eps * size)
+        return type(self)(sets.normals, offsets, validate_args=False)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
@@ -88,14 +91,22 @@ class HalfSpaces(ConstraintSet):
         )
 
     def superlevel(self) -> Rows:
-        return Rows(self.normals, *self._offsets_and_lengths())
-
-    def _offsets_and_lengths(self) -> tuple[Tensor, Tensor]:
-        """Return the offsets, infinite where every action passes, and the normals' lengths or 1."""
-        lengths = vector_norm(self.normals, dim=-1)
+        sets = self._normalized()
+        lengths = vector_norm(sets.normals, dim=-1)
         zero = lengths == 0
-        offsets = torch.where(zero & (self.offsets >= 0), torch.inf, self.offsets)
-        return offsets, lengths.masked_fill(zero, 1)
+        # Where a normal is zero, either every action passes or none does.
+        offsets = torch.where(zero & (sets.offsets >= 0), torch.inf, sets.offsets)
+        return Rows(sets.normals, offsets, lengths.masked_fill(zero, 1))
+
+    def _normalized(self) -> Self:
+        """Return the same set with normals of about unit length, which do not vanish when squared.
+
+        An offset out of range beside its normal becomes infinite: no action is as far away.
+        """
+        unit = power_of_two(self.normals.abs().amax(-1))
+        return type(self)(
+            self.normals / unit.unsqueeze(-1), self.offsets / unit, validate_args=False
+        )
 
 
 def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:

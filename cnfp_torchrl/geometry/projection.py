@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.ball import Ball
+from cnfp_torchrl.geometry.balls import Ball
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces

@@ -9,8 +9,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry.box import Box, require_action_bounds
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, broadcast_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,22 @@ class Region:
         assert isinstance(bounds, Box)
         return bounds
 
+    @property
+    def shape(self) -> torch.Size:
+        """The shape ``(*batch, d)`` of the actions."""
+        active = () if self.active is None else (self.active.shape[:-1],)
+        sets = (each.batch_shape for each in self.sets)
+        batch = broadcast_shape(self.anchor.shape[:-1], *active, *sets)
+        return torch.Size((*batch, self.anchor.shape[-1]))
+
+    def to(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Self:
+        """Return the region with sets and anchor in a dtype, all of it on a device."""
+        sets = tuple(each.to(dtype, device) for each in self.sets)
+        active = None if self.active is None else self.active.to(device)
+        return type(self)(sets, self.anchor.to(device, dtype), active, validate_args=False)
+
     def gauges(self, direction: Tensor) -> Tensor:
         """Return the gauge of the region after each stage, ``(K + 1, *batch)``.
 
@@ -68,6 +84,21 @@ class Region:
         for stage in range(1, len(self.sets)):
             inner = torch.maximum(inner, self._gauge(stage, direction))
         return outer, inner
+
+    def pulled_in(self, point: Tensor) -> Tensor:
+        """Return points ``(*batch, d)`` moved towards the anchor where they lie outside.
+
+        They end where the ray from the anchor leaves the region; points inside stay. Of an `eroded`
+        region, so that the result lies in the region itself with zero tolerance. Known as alpha
+        projection.
+        """
+        offset = point - self.anchor
+        direction, zero = scaled_direction(offset)
+        # The gauge of the offset itself; above 1 where it ends outside.
+        _, inner = self.outer_and_inner_gauge(direction)
+        gauge = inner * offset.detach().abs().amax(-1)
+        share = torch.where(zero, 1.0, 1 / gauge.clamp(min=1))
+        return self.anchor + share.unsqueeze(-1) * offset
 
     def contains(self, action: Tensor) -> Tensor:
         """Tell, with zero tolerance, whether each action lies in every active set."""
@@ -118,6 +149,8 @@ class Region:
         """
         from cnfp_torchrl.geometry.anchors import lexicographic_anchor
 
+        if sets and isinstance(sets[0], Box):
+            require_action_bounds(sets[0])
         point, active = lexicographic_anchor(sets, anchor)
         return cls(tuple(sets), point, active)
 
@@ -128,3 +161,27 @@ class Region:
         if self.active is None:
             return value
         return torch.where(self.active[..., stage], value, neutral)
+
+
+def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return an offset scaled to a largest component of one, and whether it was as good as zero.
+
+    Ratios of gauges do not depend on the length of the direction, so the scale needs no gradient;
+    in one dimension the direction is a sign and needs none either (its exact zero would come out as
+    rounding error over length). An offset of zero, which has no direction, is given one, so that
+    nothing becomes NaN; and so is one so short that gradients, which grow like 1/length, could
+    overflow when squared (1e-19 in float32, 1e-154 in float64).
+
+    Args:
+        offset: a point minus the anchor, ``(*batch, d)``.
+
+    Returns:
+        The direction ``(*batch, d)`` and the mask ``(*batch,)``.
+    """
+    length = offset.detach().abs().amax(-1, keepdim=True)
+    zero = length < torch.finfo(offset.dtype).tiny ** 0.5
+    if offset.shape[-1] == 1:
+        offset = offset.detach()
+    # Arithmetic, because torch.where is slow where the mask broadcasts.
+    one = zero.to(offset.dtype)
+    return (offset + one) / (length + one), zero.squeeze(-1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 from torch.nn.functional import pad
 
-from cnfp_torchrl.geometry.matrix_norm import spectral_norm_bound
+from cnfp_torchrl.geometry.norms import spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 
 

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
-from cnfp_torchrl.geometry import Box
+from cnfp_torchrl.geometry import Box, require_action_bounds
 from cnfp_torchrl.keys import ACTION_KEY
 
 
@@ -65,6 +65,7 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
 
     Raises:
         ValueError: when the spec has no finite bounds, is not of vectors, or is of a batch.
+        GeometryError: when its bounds are closer than rounding error, or out of the dtype's range.
     """
     leaf = spec[action_key] if isinstance(spec, Composite) else spec
     batch = tuple(spec.shape) if isinstance(spec, Composite) else ()
@@ -87,7 +88,7 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
         raise ValueError(
             f"spec of '{action_key}': expected the same bounds for all batch elements, {given}"
         )
-    return Box(low[0].clone(), high[0].clone())
+    return require_action_bounds(Box(low[0].clone(), high[0].clone()), f"spec of '{action_key}'")
 
 
 def refuse_other_bounds(what: str, bounds: Box, expected: Box) -> None:

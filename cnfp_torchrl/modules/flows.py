@@ -93,7 +93,7 @@ class RadialFlow(RegionFlow):
     """A radial squash straight onto the intersection; for one or two action dimensions."""
 
     def onto(self, region: Region) -> RadialSquash:
-        return RadialSquash(region)
+        return RadialSquash(region, validate_args=False)
 
 
 class SquashFlow(Flow):

@@ -31,7 +31,8 @@ Of what flows need:
 - `check_erosion_covers_rounding`, `check_erosion_is_small`: enough is taken away, and not too much,
 - `check_flow_stays_inside`: saturated float32 and float64 samples, with zero tolerance,
 - `check_log_det`: it is autograd's,
-- `check_around_contains_the_ball`, `check_dropped_sets_do_not_bind`.
+- `check_around_contains_the_ball`, `check_dropped_sets_do_not_bind`,
+- `check_field_range`: fields over the whole range of float32 and float64.
 """
 
 from cnfp_torchrl.testing.checker import check_constraint_set

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry import Box, ConstraintSet
-from cnfp_torchrl.testing import flows, gauges, shapes, slacks
+from cnfp_torchrl.testing import flows, gauges, ranges, shapes, slacks
 from cnfp_torchrl.testing.example import Example
 
 # Each check may rely on what those before it have found to be right.
@@ -40,6 +40,7 @@ ABOUT_ALL_ANCHORS = (
     flows.check_around_contains_the_ball,
     flows.check_dropped_sets_do_not_bind,
     slacks.check_search_keeps_the_set,
+    ranges.check_field_range,
 )
 
 

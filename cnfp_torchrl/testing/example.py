@@ -130,7 +130,7 @@ class Example:
         """
         given = self.views[0].anchor
         twice = [each.to(torch.float32) for each in (self.bounds, self.sets)]
-        magnitude = twice[0].bounding_box().magnitude()
+        magnitude = self.bounds.to(torch.float32).magnitude()
         twice = [each.eroded(magnitude).eroded(magnitude) for each in twice]
         twice = [each.to(torch.float64) for each in twice]
         views = [self.views[0]]

@@ -10,6 +10,7 @@ from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry import (
     MINIMUM_SLACK,
+    Box,
     Cone,
     ConstraintSet,
     KinkedSum,
@@ -165,7 +166,7 @@ def check_search_keeps_the_set(example: Example) -> None:
 
 def check_bounding_box(example: Example) -> None:
     """The bounding box holds what the set contains."""
-    box = example.sets.bounding_box()
+    box = Box(*example.sets.bounding_box(), validate_args=False)
     points = [example.actions(5 * _COUNT)]
     for view in example.views:
         points.append(view.at(example.sets.gauge(view.ways, view.anchor).clamp(min=1)))

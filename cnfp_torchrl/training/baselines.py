@@ -5,9 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
 
-from cnfp_torchrl.bijectors.rays import scaled_direction
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
 
@@ -54,12 +52,6 @@ class ShortestPathPolicy(TensorDictModuleBase):
         waypoint = self.path.to_goal(position, goal)
         wish = (waypoint - position) / self.path.layout.step_length
         wish = wish / wish.norm(dim=-1, keepdim=True).clamp(min=1)
-        return tensordict.set(self.head.action_key, self._push_inside(tensordict, wish))
-
-    def _push_inside(self, tensordict: TensorDictBase, wish: Tensor) -> Tensor:
-        region = self.head.get_region(tensordict).eroded()
-        offset = wish - region.anchor
-        direction, _ = scaled_direction(offset)
-        _, gauge = region.outer_and_inner_gauge(direction)
-        depth = offset.abs().amax(-1) * gauge
-        return region.anchor + offset / depth.clamp(min=1).unsqueeze(-1)
+        return tensordict.set(
+            self.head.action_key, self.head.get_region(tensordict).eroded().pulled_in(wish)
+        )

@@ -11,7 +11,6 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.bijectors import SquashChain, has_latent
-from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, snapshot_of
@@ -53,15 +52,9 @@ def replay_step(
     return _with_executed(snapshot_of(head, state, noise), action.cpu())
 
 
-def in_float64(region: Region) -> Region:
-    """Return a region in float64."""
-    sets = tuple(each.to(torch.float64) for each in region.sets)
-    return Region(sets, region.anchor.double(), region.active, validate_args=False)
-
-
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     """Return the snapshot with the executed action before all samples."""
-    region = in_float64(snapshot.region)
+    region = snapshot.region.to(torch.float64)
     staged = StagedFlow(snapshot.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
     latent, inverse_log_det = (each[-1] for each in staged.inverse(given[None]))

@@ -14,7 +14,7 @@ from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.bijectors import has_latent
-from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
 from cnfp_torchrl.visual.staged_flow import StagedFlow
@@ -199,7 +199,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     latents = loc + scale * noise.to(loc)
     latent_log_density = base.log_prob(latents).cpu()
     actions, log_dets = (each.cpu() for each in staged.forward(latents))
-    on_host = _on_host(region)
+    on_host = region.to(device="cpu")
     stages = tuple(
         Stage(
             name,
@@ -240,11 +240,3 @@ def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, 
 
 def _is_active(region: Region, index: int) -> bool:
     return region.active is None or bool(region.active[index])
-
-
-def _on_host(region: Region) -> Region:
-    def moved(each: ConstraintSet) -> ConstraintSet:
-        return each.with_fields(lambda value, _: value.cpu())
-
-    active = None if region.active is None else region.active.cpu()
-    return Region(tuple(moved(each) for each in region.sets), region.anchor.cpu(), active)

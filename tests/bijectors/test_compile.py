@@ -69,7 +69,7 @@ def build(case: Case, fields: list[dict[str, Tensor]], anchor: Tensor) -> Biject
         return ExactSquash(region, validate_args=False)
     if case.kind == "gauge":
         return GaugeSquash(region, validate_args=False)
-    return RadialSquash(region)
+    return RadialSquash(region, validate_args=False)
 
 
 def function(case: Case) -> Function:

@@ -9,7 +9,7 @@ import torch
 from mpmath import mp, mpf
 from torch import Tensor
 
-from cnfp_torchrl.bijectors.hyperbolic import atanhc, log_sech_squared, radial_log_det, tanhc
+from cnfp_torchrl.bijectors.squashes import atanhc, log_sech_squared, radial_log_det, tanhc
 
 Real = Callable[[mpf], mpf]
 

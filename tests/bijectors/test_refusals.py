@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import pytest
 import torch
 
 from cnfp_torchrl.bijectors import (
     BallSquash,
+    Bijector,
     BoxSquash,
     EllipsoidSquash,
+    ExactSquash,
     GaugeSquash,
+    Projection,
     RadialSquash,
     Retraction,
+    ShellSquash,
     SquashChain,
     paper_squash,
 )
@@ -22,6 +27,15 @@ from cnfp_torchrl.geometry import Ball, Box, GeometryError, HalfSpaces, Region
 ONE, ZERO = torch.ones(2), torch.zeros(2)
 HALF = torch.ones(2, dtype=torch.bfloat16)
 BOX = Box(-ONE, ONE)
+
+
+def projection(region: Region) -> Bijector:
+    return Projection(region, rounds=1)
+
+
+def shell(region: Region) -> Bijector:
+    radius = region.bounds.low.new_tensor(1.0)
+    return ShellSquash(region.anchor, radius / 2, radius, region)
 
 
 def unchecked_region(low: torch.Tensor, high: torch.Tensor) -> Region:
@@ -35,7 +49,7 @@ REFUSED = {
     ),
     "low equal to high": (lambda: BoxSquash(ONE, ONE), "expected low < high, given 1.0"),
     "NaN bound": (lambda: BoxSquash(ZERO, ONE * torch.nan), "field 'high' at index [0]"),
-    "unbounded": (lambda: BoxSquash(ZERO, ONE * torch.inf), "expected finite bounds, given low"),
+    "unbounded": (lambda: BoxSquash(ZERO, ONE * torch.inf), "BoxSquash: expected finite bounds"),
     "thin box": (
         lambda: BoxSquash(1000 * ONE, torch.tensor([1001.0, 1000.001])),
         "bounds further apart than rounding error in torch.float32",
@@ -98,9 +112,35 @@ REFUSED = {
     ),
     "bounds that were never checked": (
         lambda: GaugeSquash(unchecked_region(ONE, -ONE)),
-        "expected low < high, given 1.0",
+        "expected low < high, given low 1.0",
     ),
 }
+
+
+WORTHLESS_BOUNDS = {
+    "closer than rounding": (torch.float32, 1e6, 1e6 + 1),
+    "closer than rounding in float64": (torch.float64, 1e15, 1e15 + 1),
+    "beyond what can be squared": (torch.float32, -1e19, 1e19),
+    "beyond what can be squared in float64": (torch.float64, 0.0, 1e160),
+    "too close for squares": (torch.float32, -1e-20, 1e-20),
+    "open": (torch.float32, -torch.inf, 1.0),
+    "unbounded": (torch.float64, -torch.inf, torch.inf),
+}
+
+
+@pytest.mark.parametrize("build", [ExactSquash, GaugeSquash, RadialSquash, projection, shell])
+@pytest.mark.parametrize("name", WORTHLESS_BOUNDS)
+def test_bounds_that_no_flow_can_fill_are_refused(
+    name: str, build: Callable[[Region], Bijector]
+) -> None:
+    dtype, low, high = WORTHLESS_BOUNDS[name]
+    bounds = Box(ONE.to(dtype) * low, ONE.to(dtype) * high, validate_args=False)
+    with pytest.raises(GeometryError, match="bounds"):
+        build(Region((bounds,), ZERO.to(dtype)))
+    with pytest.raises(GeometryError, match="bounds"):
+        Region.build([bounds])
+    with pytest.raises(GeometryError, match="Box"):
+        BoxSquash(bounds.low, bounds.high)
 
 
 @pytest.mark.parametrize("name", REFUSED)

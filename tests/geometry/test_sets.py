@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.geometry import Box, Region
 from tests.geometry.cases import CASES, DTYPES, Case
 
 pytestmark = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -84,7 +84,7 @@ def test_slack_is_concave_in_convex_sets(case: Case) -> None:
 
 
 def test_bounding_box_holds_the_set(case: Case) -> None:
-    box = case.sets.bounding_box()
+    box = Box(*case.sets.bounding_box(), validate_args=False)
     assert torch.broadcast_shapes(box.batch_shape, case.sets.batch_shape) == case.sets.batch_shape
     for anchor in case.anchors(torch.float64):
         way = case.directions(400, torch.float64)

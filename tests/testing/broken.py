@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry import Ball, Box, Cone, ConstraintSet, Rows, VisibleRegion
-from cnfp_torchrl.geometry.constraint_set import Gauge
+from cnfp_torchrl.geometry import Ball, Bounds, Cone, ConstraintSet, Gauge, Rows, VisibleRegion
 
 
 class PlainBall(Ball):
@@ -195,9 +194,9 @@ class DroppedByInfinity(PlainBall):
 
 
 class SmallBoundingBox(PlainBall):
-    def bounding_box(self) -> Box:
+    def bounding_box(self) -> Bounds:
         half = 0.99 * self.radius.unsqueeze(-1)
-        return Box(self.center - half, self.center + half, validate_args=False)
+        return Bounds(self.center - half, self.center + half)
 
 
 class SuperlevelElsewhere(PlainBall):

@@ -73,7 +73,7 @@ def test_bounds_have_to_be_finite_and_hold_the_anchor() -> None:
 
 def test_every_check_is_made_and_listed() -> None:
     made = {*checker.OF_SHAPES, *checker.ABOUT_THE_GIVEN_ANCHOR, *checker.ABOUT_ALL_ANCHORS}
-    modules = (checker.shapes, checker.slacks, checker.gauges, checker.flows)
+    modules = (checker.shapes, checker.slacks, checker.gauges, checker.flows, checker.ranges)
     written = {
         function
         for module in modules

@@ -17,7 +17,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.facts import facts_of
-from cnfp_torchrl.visual.replay import in_float64, replay_step
+from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 from cnfp_torchrl.visual.stream import components
 from cnfp_torchrl.visual.stream.density import ActionGrid, as_bytes
@@ -160,7 +160,7 @@ class FlowStream:
                 self._map.end_episode()
 
     def _log_details(self, snapshot: FlowSnapshot, heading: str) -> None:
-        region = in_float64(snapshot.region)
+        region = snapshot.region.to(torch.float64)
         outlines: dict[tuple[int, ...], RayOutlines] = {}
 
         def seen(components: tuple[int, ...]) -> RayOutlines:

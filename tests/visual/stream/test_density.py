@@ -6,7 +6,7 @@ import torch
 from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.distributions import ConstrainedFlow
-from cnfp_torchrl.visual.replay import in_float64, replay_step
+from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.staged_flow import stage_bijector
 from cnfp_torchrl.visual.stream.density import ActionGrid, as_bytes
 from tests.visual.cases import CONFLICT, LINE, PLANE, make_actor, make_state
@@ -26,7 +26,7 @@ def test_last_stage_is_the_policys_log_density(case: str, flow: str) -> None:
     assert densities.shape == (len(snapshot.stages), *(31,) * dim)
     base = Independent(Normal(step["loc"].double(), step["scale"].double()), 1)
     bijector = stage_bijector(
-        snapshot.flow, in_float64(snapshot.region), snapshot.stages[-1].applied
+        snapshot.flow, snapshot.region.to(torch.float64), snapshot.stages[-1].applied
     )
     distribution = ConstrainedFlow(base, bijector)
     # A tenth of a step in brightness; bounds of float32 are eroded by more than those of float64.

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from cnfp_torchrl.geometry import Ball, Box, Region
-from cnfp_torchrl.visual.replay import in_float64
 from cnfp_torchrl.visual.stream.outlines import RayOutlines, within
 from tests.visual.cases import CONFLICT, LINE, PLANE, PLANE_OF_OTHERS, SPACE
 
@@ -13,7 +12,7 @@ t = torch.tensor
 
 
 def region_of(sets: dict, dim: int) -> Region:
-    return in_float64(Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()]))
+    return Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()]).to(torch.float64)
 
 
 @pytest.mark.parametrize("sets", [PLANE, PLANE_OF_OTHERS], ids=["convex", "others"])

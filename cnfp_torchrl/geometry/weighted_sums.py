@@ -1,4 +1,4 @@
-"""Sums of kinked terms, a shared base: weighted L1 balls and bounds of positive parts."""
+"""Bounds of weighted sums: weighted L1 balls, and limits of positive parts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    largest_value,
+)
+from cnfp_torchrl.geometry.norms import power_of_two
 from cnfp_torchrl.geometry.superlevel import KinkedSum
 
 
@@ -42,11 +47,13 @@ class KinkedSumBound(ConstraintSet):
         yield "bound", (self.bound <= 0) | self.bound.isinf(), "a finite bound > 0"
 
     def contains(self, action: Tensor) -> Tensor:
-        return self._total(self.weights.double(), action.double()) <= self.bound.double()
+        sets = self.to(torch.float64)._normalized()
+        return sets._total(action.double()) <= sets.bound
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(bound - sum) / |weights|``; infinite where all weights are zero."""
-        return (self.bound - self._total(self.weights, action)) / vector_norm(self.weights, dim=-1)
+        sets = self._normalized()
+        return (sets.bound - sets._total(action)) / vector_norm(sets.weights, dim=-1)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         r"""Return the gauge about an anchor, in O(d log d).
@@ -56,15 +63,16 @@ class KinkedSumBound(ConstraintSet):
         :math:`g = \max(0, \max_j S_j / (bound - I_j))`, where a piece's :math:`bound - I_j` is
         positive because the sum at t = 0 is below the bound.
         """
-        side = self._side_at_exit(direction.detach(), anchor.detach())
-        room = self.bound - (side * anchor).sum(-1)
+        sets = self._normalized()
+        side = sets._side_at_exit(direction.detach(), anchor.detach())
+        room = sets.bound - (side * anchor).sum(-1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
-    def bounding_box(self) -> Box:
+    def bounding_box(self) -> Bounds:
         upper, lower = self.slopes(self.weights)
         bound = self.bound.unsqueeze(-1)
         # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
-        return Box(-bound / lower.abs(), bound / upper, validate_args=False)
+        return Bounds(-bound / lower.abs(), bound / upper)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # The sum is at most |center|_1 at the center, and grows at most by one each unit.
@@ -72,10 +80,20 @@ class KinkedSumBound(ConstraintSet):
         return type(self)(weights, center.abs().sum(-1) + radius, validate_args=False)
 
     def superlevel(self) -> KinkedSum:
-        return KinkedSum(*self.slopes(self.weights), self.bound, vector_norm(self.weights, dim=-1))
+        sets = self._normalized()
+        return KinkedSum(*self.slopes(sets.weights), sets.bound, vector_norm(sets.weights, dim=-1))
 
-    def _total(self, weights: Tensor, action: Tensor) -> Tensor:
-        upper, lower = self.slopes(weights)
+    def _normalized(self) -> Self:
+        """Return the same set with weights of about unit size, which do not vanish when squared.
+
+        A bound out of range beside the weights is lowered to the range: no action is as far away.
+        """
+        unit = power_of_two(self.weights.abs().amax(-1))
+        bound = (self.bound / unit).clamp(max=largest_value(self.dtype))
+        return type(self)(self.weights / unit.unsqueeze(-1), bound, validate_args=False)
+
+    def _total(self, action: Tensor) -> Tensor:
+        upper, lower = self.slopes(self.weights)
         return torch.maximum(upper * action, lower * action).sum(-1)
 
     def _side_at_exit(self, direction: Tensor, anchor: Tensor) -> Tensor:
@@ -100,3 +118,50 @@ class KinkedSumBound(ConstraintSet):
 def _running(terms: Tensor, changes: Tensor) -> Tensor:
     """Return the sum of the terms, and after each change, ``(*batch, d + 1)``."""
     return torch.cat([terms.sum(-1, keepdim=True), changes], -1).cumsum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedL1Ball(KinkedSumBound):
+    r"""The weighted L1 ball :math:`\{a : \sum_i |weights_i a_i| \le bound\}`.
+
+    With joint velocities as weights and torques as actions it limits the power of all joints.
+
+    Args:
+        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
+        bound: ``(*batch,)``, positive and finite.
+    """
+
+    @staticmethod
+    def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
+        return weights.abs(), -weights.abs()
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        # The terms of two actions in the set differ by no more than twice the bound in sum, so the
+        # rounding errors do not depend on the actions' size.
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        sets = self._normalized()
+        return type(self)(sets.weights, sets.bound * (1 - 2 * eps), validate_args=False)
+
+
+@dataclass(frozen=True, eq=False)
+class PositivePart(KinkedSumBound):
+    r"""The unbounded set :math:`\{a : \sum_i \max(weights_i a_i, 0) \le bound\}`.
+
+    With joint velocities as weights and torques as actions it limits the power that the joints
+    draw; power that they return does not count.
+
+    Args:
+        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
+        bound: ``(*batch,)``, positive and finite.
+    """
+
+    @staticmethod
+    def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
+        return weights.clamp(min=0), weights.clamp(max=0)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        # Terms may be as negative as the actions allow on the way to where they become positive.
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        sets = self._normalized()
+        size = sets.bound + sets.weights.abs().sum(-1) * magnitude
+        return type(self)(sets.weights, sets.bound - eps * size, validate_args=False)

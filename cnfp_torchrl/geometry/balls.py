@@ -1,0 +1,313 @@
+"""Balls and their affine relatives: ellipsoids, and balls in a task space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.linalg import solve_triangular, vector_norm
+
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_bound
+from cnfp_torchrl.geometry.superlevel import Cone
+
+MOST_SKEWED = 1e15
+"""The largest element of an ellipsoid's inverse, in units of the smallest diagonal element."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ball(ConstraintSet):
+    r"""The ball :math:`\{a : |a - center| \le radius\}`.
+
+    Args:
+        center: ``(*batch, d)``.
+        radius: ``(*batch,)``, positive and finite.
+    """
+
+    center: Tensor
+    radius: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 0}
+
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "center", self.center.isinf(), "a finite center"
+
+    def whiten(self, vector: Tensor) -> Tensor:
+        """Return the vector in units of the radius, in which the ball is a unit ball."""
+        return vector / self.radius.unsqueeze(-1)
+
+    def contains(self, action: Tensor) -> Tensor:
+        offset = action.double() - self.center.double()
+        return length(offset) <= self.radius.double()
+
+    def slack(self, action: Tensor) -> Tensor:
+        return self.radius - length(action - self.center)
+
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
+
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        return ball_gauge_about(anchor - self.center, self.radius)
+
+    def bounding_box(self) -> Bounds:
+        radius = self.radius.unsqueeze(-1)
+        return Bounds(self.center - radius, self.center + radius)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        size = self.radius + length(self.center)
+        return type(self)(self.center, torch.sub(self.radius, size, alpha=eps), validate_args=False)
+
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        return type(self)(center, radius.expand(center.shape[:-1]), validate_args=False)
+
+    def superlevel(self) -> Cone:
+        identity = torch.eye(self.dim, dtype=self.dtype, device=self.center.device)
+        return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
+
+    def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
+        # The radius alone, because torch.where is slow where the mask broadcasts. A far center's
+        # distance is known up to rounding error, which may be larger than what is to be added.
+        distance = length(center - self.center)
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        beyond = torch.add(distance, distance, alpha=eps) + radius
+        return type(self)(
+            self.center, torch.where(active, self.radius, beyond), validate_args=False
+        )
+
+    def inner_ball(self, radius: float) -> Self:
+        r"""Return the ball of at most the given radius inside this one that is nearest to 0.
+
+        Its anchor is :math:`m \max(0, 1 - (r - \rho)/|m|)` with :math:`\rho = \min(r, radius)`: 0
+        when this ball has room for it there, and on the way to this ball's center m otherwise.
+        """
+        inner = self.radius.clamp(max=radius)
+        distance = length(self.center)
+        room = self.radius - inner
+        share = torch.where(room >= distance, torch.zeros_like(room), 1 - room / distance)
+        return type(self)(self.center * share.unsqueeze(-1), inner, validate_args=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid(ConstraintSet):
+    r"""The ellipsoid :math:`\{m + T x : |x| \le 1\}` with T lower triangular.
+
+    Args:
+        center: m, ``(*batch, d)``.
+        scale_tril: T, ``(*batch, d, d)``, zero above its positive diagonal.
+    """
+
+    center: Tensor
+    scale_tril: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "scale_tril": 2}
+
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "center", self.center.isinf(), "a finite center"
+        yield "scale_tril", self.scale_tril.isinf(), "finite elements"
+        yield "scale_tril", self.scale_tril.triu(1) != 0, "zeros above the diagonal"
+        diagonal = torch.eye(self.dim, dtype=torch.bool, device=self.scale_tril.device)
+        yield "scale_tril", (self.scale_tril <= 0) & diagonal, "a positive diagonal"
+        thin = ~(spectral_norm_bound(self._inverse()) < MOST_SKEWED)
+        yield (
+            "scale_tril",
+            thin,
+            f"an inverse below {MOST_SKEWED:g} over the smallest of its diagonal",
+        )
+
+    def shape_problem(self) -> str | None:
+        rows, columns = self.scale_tril.shape[-2:]
+        if rows == columns:
+            return None
+        return f"expected a square 'scale_tril' (*batch, d, d), given {rows} by {columns}"
+
+    def whiten(self, vector: Tensor) -> Tensor:
+        """Return ``T^-1 vector``, the vector in coordinates where the ellipsoid is a unit ball."""
+        return _solve(self.scale_tril, vector)
+
+    def contains(self, action: Tensor) -> Tensor:
+        return self.to(torch.float64).slack(action.double()) >= 0
+
+    def slack(self, action: Tensor) -> Tensor:
+        """Return ``(1 - |T^-1 (a - m)|) / n``, n a bound of the norm of ``T^-1``."""
+        unit, scale_tril = self._in_units()
+        offset = action - self.center
+        size = power_of_two(offset.abs().amax(-1))
+        white = size * length(_solve(scale_tril, offset / size.unsqueeze(-1)))
+        return (unit - white) / spectral_norm_bound(self._inverse())
+
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
+
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        unit, scale_tril = self._in_units()
+        of_ball = ball_gauge_about(_solve(scale_tril, anchor - self.center), unit)
+        return lambda direction: of_ball(_solve(scale_tril, direction))
+
+    def bounding_box(self) -> Bounds:
+        half = length(self.scale_tril)
+        return Bounds(self.center - half, self.center + half)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        size = length(self.scale_tril.flatten(-2)) + length(self.center)
+        # An ellipsoid thinner than its rounding error must not turn inside out: what is left of it
+        # has no slack to speak of, so that it is dropped like an empty set.
+        unit, _ = self._in_units()
+        share = (1 - eps * (size / unit) * spectral_norm_bound(self._inverse())).clamp(min=eps)
+        return type(self)(
+            self.center, self.scale_tril * share[..., None, None], validate_args=False
+        )
+
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        scale_tril = self._identity() * radius[..., None, None]
+        return type(self)(center, scale_tril, validate_args=False)
+
+    def superlevel(self) -> Cone:
+        unit, scale_tril = self._in_units()
+        inverse = self._inverse()
+        return Cone(inverse, -_solve(scale_tril, self.center), unit, spectral_norm_bound(inverse))
+
+    def _identity(self) -> Tensor:
+        return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
+
+    def _in_units(self) -> tuple[Tensor, Tensor]:
+        """Return the shortest half-axis u, or so, as a power of two, and ``T / u``.
+
+        In such units an inverse, and what it is applied to, have sizes that can be squared.
+        """
+        unit = power_of_two(self.scale_tril.diagonal(dim1=-2, dim2=-1).amin(-1))
+        return unit, self.scale_tril / unit[..., None, None]
+
+    def _inverse(self) -> Tensor:
+        """Return ``u T^-1``, with the u of `_in_units`."""
+        return solve_triangular(self._in_units()[1], self._identity(), upper=False)
+
+
+def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
+    return solve_triangular(scale_tril, vector.unsqueeze(-1), upper=False).squeeze(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskSpaceBall(ConstraintSet):
+    r"""The set :math:`\{a : |J a + b| \le radius\}`, convex; unbounded if J has a null space.
+
+    With J a manipulator's Jacobian and a its joint velocities: a limit of the end effector's speed
+    (b = 0), or of the distance to a wanted velocity -b. With J some rows of the identity: a ball in
+    some of the components. Where J is zero every action passes if b is short enough, else none.
+
+    Args:
+        jacobian: J, ``(*batch, m, d)``, finite.
+        offset: b, ``(*batch, m)``, finite.
+        radius: ``(*batch,)``, positive and finite.
+    """
+
+    jacobian: Tensor
+    offset: Tensor
+    radius: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {"jacobian": 2, "offset": 1, "radius": 0}
+
+    def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
+        yield "jacobian", self.jacobian.isinf(), "finite elements"
+        yield "offset", self.offset.isinf(), "a finite offset"
+        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+
+    def shape_problem(self) -> str | None:
+        rows, components = self.jacobian.shape[-2], self.offset.shape[-1]
+        if rows == components and rows > 0:
+            return None
+        return (
+            "expected as many components of the offset as rows of the jacobian, at least 1, given "
+            f"{components} and {rows}"
+        )
+
+    @classmethod
+    def fields_of_other_width(cls) -> frozenset[str]:
+        return frozenset({"offset"})
+
+    def contains(self, action: Tensor) -> Tensor:
+        image = _image(self.jacobian.double(), action.double()) + self.offset.double()
+        return length(image) <= self.radius.double()
+
+    def slack(self, action: Tensor) -> Tensor:
+        """Return ``(radius - |J a + b|) / n``, n a bound of the norm of J, or 1 where J is zero."""
+        distance = length(_image(self.jacobian, action) + self.offset)
+        return (self.radius - distance) / self._norm()
+
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return self.gauge_about(anchor)(direction)
+
+    def gauge_about(self, anchor: Tensor) -> Gauge:
+        # In units of J's norm: what vanishes does so beside it, not beside one.
+        norm = self._norm()
+        offset = _image(self.jacobian, anchor) + self.offset
+        jacobian = self.jacobian / norm[..., None, None]
+        return partial(_image_gauge, jacobian, ball_gauge_about(offset, self.radius, norm))
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
+        terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
+        size = self.radius + length(terms)
+        radius = torch.sub(self.radius, size, alpha=eps)
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        offset = -_image(self.jacobian, center)
+        return type(self)(self.jacobian, offset, self._norm() * radius, validate_args=False)
+
+    def superlevel(self) -> Cone:
+        return Cone(self.jacobian, self.offset, self.radius, self._norm())
+
+    def _norm(self) -> Tensor:
+        bound = spectral_norm_bound(self.jacobian)
+        return bound.masked_fill(bound == 0, 1)
+
+
+def _image_gauge(jacobian: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
+    image = _image(jacobian, direction)
+    # In J's null space the set has no end. A direction whose image vanishes when squared is given
+    # another one there, so that nothing becomes NaN.
+    vanishes = image.abs().amax(-1) < torch.finfo(image.dtype).tiny ** 0.5
+    return of_ball(image + vanishes.unsqueeze(-1)).masked_fill(vanishes, 0)
+
+
+def _image(jacobian: Tensor, vector: Tensor) -> Tensor:
+    return (jacobian * vector.unsqueeze(-2)).sum(-1)
+
+
+def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None) -> Gauge:
+    r"""Return the gauge of a ball about a point at an offset from the ball's center.
+
+    With :math:`k = (r - |w|)(r + |w|)`, :math:`\beta = v \cdot w/k` and :math:`q = |v|^2/k`:
+    :math:`g = \beta + \sqrt{\beta^2 + q}`, which cancels for :math:`\beta < 0`. With
+    :math:`p = 2\max(\beta, 0)` and :math:`h = \sqrt{\beta^2 + q} + |\beta|`, written
+    :math:`\sqrt{\beta^2 + q} + p - \beta` to have the right gradient at 0, :math:`g = p + q/h`
+    never does. Computed in units of the larger one of radius and offset, whose squares may be out
+    of range.
+
+    Args:
+        offset: w, the point minus the ball's center, ``(*batch, d)``, shorter than the radius.
+        radius: r, ``(*batch,)``.
+        unit: the length that directions are given in, ``(*batch,)``; None means 1.
+    """
+    size = power_of_two(torch.maximum(radius, offset.abs().amax(-1)))
+    offset, radius = offset / size.unsqueeze(-1), radius / size
+    distance = vector_norm(offset, dim=-1)
+    inverse = ((radius - distance) * (radius + distance)).reciprocal()
+    scale = size.reciprocal() if unit is None else unit / size
+    return partial(_ball_gauge, offset * inverse.unsqueeze(-1), inverse, scale)
+
+
+def _ball_gauge(scaled_offset: Tensor, inverse: Tensor, scale: Tensor, direction: Tensor) -> Tensor:
+    beta = (direction * scaled_offset).sum(-1)
+    q = direction.square().sum(-1) * inverse
+    ahead = beta.relu()
+    h = torch.add(torch.addcmul(q, beta, beta).sqrt(), ahead, alpha=2) - beta
+    return torch.add(q / h, ahead, alpha=2) * scale

@@ -1,0 +1,47 @@
+"""Norms that neither overflow nor underflow where the result is a number of the dtype."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+
+def power_of_two(size: Tensor) -> Tensor:
+    """Return the powers of two next below sizes, and 1 for 0 and for what is no finite number.
+
+    Units to compute in: dividing by them changes the exponent alone, so that nothing is rounded. No
+    gradient passes.
+    """
+    size = size.detach()
+    mantissa, _ = torch.frexp(size)
+    return (size / (2 * mantissa)).nan_to_num(1.0)
+
+
+def length(vector: Tensor) -> Tensor:
+    """Return the Euclidean norm, ``(*batch,)``, of vectors whose squares may be out of range.
+
+    `torch.linalg.vector_norm` gives 0 for lengths below 1e-23 in float32, and infinity above 1e19.
+
+    Args:
+        vector: ``(*batch, d)``.
+    """
+    unit = power_of_two(vector.abs().amax(-1))
+    return unit * vector_norm(vector / unit.unsqueeze(-1), dim=-1)
+
+
+def spectral_norm_bound(matrix: Tensor) -> Tensor:
+    r"""Return a bound of the spectral norm, :math:`\min(\sqrt{|M|_1 |M|_\infty}, |M|_F)`.
+
+    Exact where M is diagonal and where it has one row or one column.
+
+    Args:
+        matrix: M, ``(*batch, m, d)``.
+    """
+    if 0 in matrix.shape[-2:]:
+        return matrix.new_zeros(matrix.shape[:-2])
+    size = matrix.abs()
+    unit = size.amax((-2, -1))
+    size = size / unit.masked_fill(unit == 0, 1)[..., None, None]
+    bound = (size.sum(-1).amax(-1) * size.sum(-2).amax(-1)).sqrt()
+    return unit * torch.minimum(bound, vector_norm(size, dim=(-2, -1)))
