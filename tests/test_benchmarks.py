@@ -26,3 +26,17 @@ def test_the_stream_is_timed_and_tabulated(tmp_path: Path) -> None:
     for name, row in document["rows"].items():
         (milliseconds,) = row["ms"]
         assert f"| {name} | {milliseconds:.2f} |" in text
+
+
+def test_updates_and_training_are_timed_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "updates.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    document = json.loads((tmp_path / "updates.json").read_text())
+    assert "stable-baselines3" in document["about"]
+    text = (tmp_path / "updates.md").read_text()
+    update, training = document["results"].values()
+    assert set(training["rows"]) < set(update["rows"])
+    for row in (*update["rows"].values(), *training["rows"].values()):
+        assert 0 < row["low"] <= row["ratio"] <= row["high"]
+        assert f"| {row['ratio']:.2f} |" in text
+    assert update["rows"]["Stable-Baselines3"]["ratio"] == 1

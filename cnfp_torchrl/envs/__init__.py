@@ -5,7 +5,9 @@ from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
 from cnfp_torchrl.envs.constrain_env import constrain_env
 from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
+from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
 
 # Whoever has an environment in hand looks for these here.
 from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
@@ -16,9 +18,12 @@ __all__ = [
     "ConstraintCost",
     "GeometryTransform",
     "Indicator",
+    "PackedStates",
     "RewardPenalty",
+    "SampledGeometry",
     "appended_transforms",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
+    "constraints_to_sample",
 ]

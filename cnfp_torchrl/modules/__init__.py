@@ -3,6 +3,7 @@
 from cnfp_torchrl.keys import MissingGeometryError
 from cnfp_torchrl.modules.action_bounds import ActionBounds, action_bounds, refuse_other_bounds
 from cnfp_torchrl.modules.actors import (
+    actor_modules,
     constrain,
     flow_head,
     has_density,
@@ -54,6 +55,7 @@ __all__ = [
     "UnconstrainedFlow",
     "WarmUpPolicy",
     "action_bounds",
+    "actor_modules",
     "appended_transforms",
     "constrain",
     "constraint_bijectors",

@@ -6,14 +6,15 @@ from typing import Any, Literal
 
 from tensordict.nn import TensorDictModule
 from torchrl.modules import SafeProbabilisticTensorDictSequential
-from torchrl.objectives import SACLoss, ValueEstimators
+from torchrl.objectives import ValueEstimators
 
 from cnfp_torchrl.modules import has_density, with_reference_entropy
+from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
 
 Entropy = Literal["reference", "action"]
 
 
-class ConstrainedSACLoss(SACLoss):
+class ConstrainedSACLoss(BatchedSACLoss):
     r"""TorchRL's SAC loss with a choice of the entropy that is rewarded.
 
     ``action`` takes :math:`-\log\pi(a|s)`, the entropy of the action itself. ``reference`` leaves
@@ -27,7 +28,7 @@ class ConstrainedSACLoss(SACLoss):
         qvalue_network: reads observation and action, writes ``state_action_value``.
         entropy: ``reference`` or ``action``.
         gamma: discount factor, in [0, 1).
-        kwargs: passed on to `torchrl.objectives.SACLoss`.
+        kwargs: passed on to `BatchedSACLoss`, which takes those of `torchrl.objectives.SACLoss`.
 
     Raises:
         ValueError: for an unknown entropy, for ``action`` where actions have no density, and for a

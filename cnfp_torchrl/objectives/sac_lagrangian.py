@@ -12,11 +12,8 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
-from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import SACLoss
-from torchrl.objectives.utils import _vmap_func
 
 from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
 
@@ -135,7 +132,6 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         self.gamma_cost = gamma_cost
         self.lambda_max = lambda_max
         self.constraint_names = tuple(names)
-        self._make_vmap()
         self._set_in_keys()
         logged = [f"{kind}_{name}" for kind in ("lambda", "cost_value") for name in names]
         self._out_keys = [*self.out_keys, "loss_cost", "loss_lagrange", *logged]
@@ -151,20 +147,9 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         # parameter to run away behind the bound, from where it would not come back in time.
         self.log_lagrange.data.clamp_(max=math.log(self.lambda_max))
 
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        if "cost_network" not in self.__dict__:  # SACLoss calls this before the network is here
-            return
-        self._vmap_cost_network = _vmap_func(
-            self.cost_network,
-            (None, 0),
-            randomness=self.vmap_randomness,
-            pseudo_vmap=self.deactivate_vmap,
-        )
-
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        if "cost_network" not in self.__dict__:  # as above
+        if "cost_network" not in self.__dict__:  # SACLoss calls this before the network is here
             return
         cost = ("next", self.tensor_keys.cost)
         self._in_keys = list({*self._in_keys, cost, *self.cost_network.in_keys})
@@ -175,11 +160,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         loss_qvalue, qvalue_metadata = self.qvalue_v2_loss(tensordict)
         loss_cost = self.cost_loss(tensordict)
         loss_actor, metadata = self.actor_loss(tensordict)
-        loss_alpha = self._reduce_loss(
-            self._alpha_loss(log_prob=metadata["log_prob"]),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        loss_alpha = self._reduced(self._alpha_loss(metadata["log_prob"]), tensordict)
         tensordict.set(self.tensor_keys.priority, qvalue_metadata["td_error"])
         expected_cost = metadata["cost_value"].flatten(0, -2).mean(0)
         losses = {
@@ -200,32 +181,21 @@ class SACLagrangianLoss(ConstrainedSACLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the actor's loss, and ``log_prob`` and ``cost_value`` of the drawn actions."""
         action, log_prob = self._draw(tensordict)
-        value = self._vmap_qnetworkN0(
-            self._inputs(tensordict, self.qvalue_network, action),
-            self._cached_detached_qvalue_params,
-        ).get(self.tensor_keys.state_action_value)
-        cost = self._cost(tensordict, action, self.cost_network_params.detach()).amax(0)
+        value = self._values("qvalue_network", tensordict, action, detached=True)
+        cost = self._costs("cost_network", tensordict, action, detached=True).amax(0)
         price = (self.multipliers * cost).sum(-1)
-        loss = self._reduce_loss(
-            self._alpha * log_prob - value.amin(0).squeeze(-1) + price,
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        loss = self._reduced(self._alpha * log_prob - value.amin(0).squeeze(-1) + price, tensordict)
         return loss, {"log_prob": log_prob.detach(), "cost_value": cost.detach()}
 
     def cost_loss(self, tensordict: TensorDictBase) -> Tensor:
         """Return the cost critic's loss, summed over constraints and networks."""
         action = tensordict.get(self.tensor_keys.action)
-        predicted = self._cost(tensordict, action, self.cost_network_params)
+        predicted = self._costs("cost_network", tensordict, action)
         target = self._cost_target(tensordict).expand_as(predicted)
         # Not the robust loss of the value critic: it estimates something like a median, and that of
         # a rare event, such as reaching a station just in time, is its absence.
         loss = (predicted - target).square()
-        return self._reduce_loss(
-            loss.sum(-1).sum(0),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        return self._reduced(loss.sum(-1).sum(0), tensordict)
 
     def lagrange_loss(self, expected_cost: Tensor) -> Tensor:
         """Return the multipliers' loss.
@@ -248,27 +218,15 @@ class SACLagrangianLoss(ConstrainedSACLoss):
                 f"{tuple(cost.shape)}"
             )
         action, _ = self._draw(outcome)
-        after = self._cost(outcome, action, self.target_cost_network_params).amax(0)
+        after = self._costs("target_cost_network", outcome, action).amax(0)
         goes_on = ~outcome.get(self.tensor_keys.terminated)
         return cost + self.gamma_cost * goes_on * after
 
-    def _draw(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        with (
-            set_exploration_type(ExplorationType.RANDOM),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            return rsample_and_log_prob(self.actor_network.get_dist(tensordict))
-
-    def _inputs(
-        self, tensordict: TensorDictBase, network: TensorDictModule, action: Tensor
-    ) -> TensorDictBase:
-        selected = tensordict.select(*network.in_keys, strict=False)
-        return selected.set(self.tensor_keys.action, action)
-
-    def _cost(self, tensordict: TensorDictBase, action: Tensor, params: TensorDictParams) -> Tensor:
-        """Return the cost values of actions, ``(num_cost_nets, *batch, K)``."""
-        inputs = self._inputs(tensordict, self.cost_network, action)
-        cost = self._vmap_cost_network(inputs, params).get(self.tensor_keys.state_action_cost)
+    def _costs(
+        self, name: str, tensordict: TensorDictBase, action: Tensor, *, detached: bool = False
+    ) -> Tensor:
+        """Return the cost values of actions, ``(num_cost_nets, *batch, K)``; see `_values`."""
+        cost = self._values(name, tensordict, action, detached=detached)
         if cost.shape[-1] != len(self.constraint_names):
             raise ValueError(
                 f"cost_network: expected an output for each of the constraints "

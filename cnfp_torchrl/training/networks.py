@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
@@ -38,17 +37,6 @@ def gaussian_network(
     )
 
 
-class _ActionValue(nn.Module):
-    """Feed observation and action to a network as one vector."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        return self.network(torch.cat([observation, action], dim=-1))
-
-
 def action_value_network(
     observation_size: int, action_size: int, *, hidden: Sequence[int] = (256, 256)
 ) -> ValueOperator:
@@ -59,7 +47,7 @@ def action_value_network(
         num_cells=list(hidden),
         activation_class=nn.ReLU,
     )
-    return ValueOperator(_ActionValue(network), in_keys=["observation", "action"])
+    return ValueOperator(network, in_keys=["observation", "action"])
 
 
 def action_cost_network(
@@ -84,5 +72,5 @@ def action_cost_network(
         activation_class=nn.ReLU,
     )
     # Costs are not negative: an actor would exploit a critic that promised less than none.
-    costs = _ActionValue(nn.Sequential(network, nn.Softplus()))
-    return TensorDictModule(costs, ["observation", "action"], ["state_action_cost"])
+    network.append(nn.Softplus())
+    return TensorDictModule(network, ["observation", "action"], ["state_action_cost"])

@@ -69,6 +69,7 @@ FREE_OR_PORT = Expected(f"{PORT.words}, or null", lambda x: x is None or PORT.fi
 _EXPECTED = {
     "seed": WHOLE,
     "threads": COUNT,
+    "compile": FLAG,
     "batch": COUNT,
     "env.agents": COUNT,
     "env.penalty.penalty": POSITIVE,
@@ -137,6 +138,8 @@ class TrainingSettings:
         warmup_frames: environment steps with safe random actions, before the actor acts and learns.
         update_ratio: updates for each environment step.
         log_interval: environment steps between two entries of the log.
+        constraint_bytes: how much of a transition may be stored for constraints; sets that do not
+            fit are computed anew at sampling, which takes a little time.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -145,11 +148,13 @@ class TrainingSettings:
     warmup_frames: int = 1000
     update_ratio: float = 0.5
     log_interval: int = 400
+    constraint_bytes: int = 64
 
     def __post_init__(self) -> None:
         WHOLE.require("training.warmup_frames", self.warmup_frames)
         NOT_NEGATIVE.require("training.update_ratio", self.update_ratio)
         COUNT.require("training.log_interval", self.log_interval)
+        WHOLE.require("training.constraint_bytes", self.constraint_bytes)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import config_directory
@@ -29,6 +28,8 @@ from cnfp_torchrl.training.settings import (
     require_frames,
     require_settings,
 )
+from cnfp_torchrl.training.storage import prepare_buffer
+from cnfp_torchrl.training.update import Update
 from cnfp_torchrl.training.watching import (
     RECORDING,
     EpisodeCollector,
@@ -75,16 +76,24 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
+    update = Update(loss, optimizer, target, compiled=config.compile)
 
     # Data
     policy = WarmUpPolicy(actor, settings.warmup_frames)
+    if config.compile:
+        # Not the policy around it, which counts: a number that changes would be compiled anew.
+        policy.actor = torch.compile(actor)
     collector = instantiate(config.collector, _partial_=True)(env, policy)
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
-    kept = [*actor.in_keys, "action"]
-    kept += [("next", key) for key in (*actor.in_keys, "reward", "done", "terminated")]
-    kept += [key for key in [("next", "cost")] if key in loss.in_keys]
+    kept = prepare_buffer(
+        buffer,
+        env,
+        actor.in_keys,
+        other_keys=[key for key in [("next", "cost")] if key in loss.in_keys],
+        constraint_bytes=settings.constraint_bytes,
+    )
 
     watcher: TrainingWatcher = Unwatched()
     if watch is not None:
@@ -100,14 +109,6 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         interval=settings.log_interval,
     )
 
-    def update() -> TensorDictBase:
-        losses = loss(buffer.sample())
-        optimizer.zero_grad()
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        optimizer.step()
-        target.step()
-        return losses
-
     owed = 0.0
     with closing(watcher):
         for collected in collector:
@@ -118,7 +119,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             if metrics.frames >= settings.warmup_frames:
                 owed += batch.numel() * settings.update_ratio
                 while owed >= 1:
-                    metrics.add_losses(update())
+                    metrics.add_losses(update(buffer.sample()))
                     owed -= 1
             metrics.log_if_due()
         metrics.finish()

@@ -296,7 +296,7 @@ def test_the_discount_is_used(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"entropy": "unconstrained"}, "entropy: expected 'reference' or 'action', given 'none'"),
+        ({"entropy": "none"}, "entropy: expected 'reference' or 'action', given 'none'"),
         ({"gamma": 1.0}, r"gamma: expected a discount in \[0, 1\), given 1.0"),
         ({"gamma": -0.1}, r"gamma: expected a discount in \[0, 1\), given -0.1"),
         ({"gamma": float("nan")}, r"gamma: expected a discount in \[0, 1\), given nan"),

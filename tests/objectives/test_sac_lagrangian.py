@@ -363,9 +363,9 @@ def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDict
         ({"lambda_init": 200.0}, r"lambda_init: expected .*lambda_max = 100.0\], given 200.0"),
         ({"lambda_init": 0.0}, "lambda_init: expected a number in .* given 0.0"),
         ({"num_cost_nets": 0}, "num_cost_nets: expected a number >= 1, given 0"),
-        ({"reduction": "unconstrained"}, "reduction: expected 'mean' or 'sum', given 'none'"),
+        ({"reduction": "none"}, "reduction: expected 'mean' or 'sum', given 'none'"),
         ({"skip_done_states": True}, "skip_done_states: expected it left out"),
-        ({"entropy": "unconstrained"}, "entropy: expected 'reference' or 'action', given 'none'"),
+        ({"entropy": "none"}, "entropy: expected 'reference' or 'action', given 'none'"),
     ],
 )
 def test_bad_settings_are_refused(

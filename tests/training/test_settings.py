@@ -97,6 +97,7 @@ def test_settings_of_other_libraries_own_options_are_left_to_them(
 ) -> None:
     config = make_config(
         "optim._target_=torch.optim.RMSprop",
+        "~optim.fused",
         "+optim.momentum=0.5",
         "~target.tau",
         "+target.eps=0.99",

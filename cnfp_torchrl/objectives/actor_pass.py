@@ -1,0 +1,117 @@
+"""Distributions of an actor without the bookkeeping of its modules, which exceeds small networks'.
+
+tensordict 0.14 looks on disk for pandas at each entry that a TensorDictModule writes, which alone
+takes longer than a small network does. Modules that only call their network are therefore left out
+of the way here; any other actor is asked for its distribution as usual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torchrl.modules import SafeModule, ValueOperator
+
+from cnfp_torchrl.modules import ConstrainedFlowModule, actor_modules
+
+_PLAIN_MODULES = (TensorDictModule, SafeModule, ValueOperator)
+
+_BLOCK = 16
+"""torch's generator on a CPU fills tensors of normal numbers in blocks of so many."""
+
+
+def is_plain(module: nn.Module) -> bool:
+    """Tell whether a module only calls its network on its in_keys and writes what that returns."""
+    return (
+        type(module) in _PLAIN_MODULES
+        and module.method is None
+        and module._kwargs is None
+        and "_" not in module.out_keys
+        and not (module._forward_hooks or module._forward_pre_hooks or module._backward_hooks)
+    )
+
+
+def distribution(
+    actor: ProbabilisticTensorDictSequential, tensordict: TensorDictBase
+) -> Distribution:
+    """Return ``actor.get_dist(tensordict)``; the tensordict stays as it is."""
+    *body, head = actor_modules(actor)
+    if actor.return_composite or not all(map(is_plain, body)):
+        return actor.get_dist(tensordict.copy())
+    written = _written(body, tensordict)
+    if not all(isinstance(key, str) for key in written):
+        return actor.get_dist(tensordict.copy())
+    # Entries that are tensordicts are shared, which is safe because only strings are written.
+    entries = {**dict(tensordict.items()), **written}
+    return head.get_dist(TensorDict(entries, tensordict.batch_size, tensordict.device))
+
+
+def distribution_of_both(
+    actor: ProbabilisticTensorDictSequential, first: TensorDictBase, second: TensorDictBase
+) -> Distribution | None:
+    """Return the distribution over actions in two batches of states at once, ``(2, *batch)``.
+
+    The flow of a constrained actor consists of many operations on few numbers, which take as long
+    for twice as many. The first states get no gradient from the actor's networks.
+
+    Args:
+        actor: any; there is no such distribution for one that is not constrained, or where its
+            samples would not be those of two draws, the first batch's before the second's.
+        first: states ``(*batch,)``.
+        second: others, as many.
+    """
+    *body, head = actor_modules(actor)
+    is_constrained = isinstance(head, ConstrainedFlowModule)
+    if not is_constrained or actor.return_composite or not all(map(is_plain, body)):
+        return None
+    with torch.no_grad():
+        written = [_written(body, first)]
+    written.append(_written(body, second))
+    location = written[1].get(head.parameter_keys[0])
+    if location is None or (location.device.type == "cpu" and location.numel() % _BLOCK):
+        return None
+    states = _Both((first, second), written)
+    return head.get_dist(cast(TensorDictBase, states))
+
+
+class _Both:
+    """Two batches of states that are stacked entry by entry as these are read.
+
+    What of a tensordict a `ConstrainedFlowModule` asks for: building one, with its nested ones,
+    takes half as long as building the flow.
+    """
+
+    def __init__(
+        self, parts: Sequence[TensorDictBase], written: Sequence[dict[NestedKey, Tensor]]
+    ) -> None:
+        self._parts, self._written = parts, written
+        self.shape = self.batch_size = torch.Size((2, *parts[0].batch_size))
+        self.device = parts[0].device
+
+    def get(self, key: NestedKey, default: Tensor | None = None) -> Tensor | None:
+        values = [
+            known[key] if key in known else part.get(key, None)
+            for part, known in zip(self._parts, self._written, strict=True)
+        ]
+        return default if any(value is None for value in values) else torch.stack(values)
+
+    def keys(self, *args: Any, **kwargs: Any) -> Iterable[NestedKey]:
+        return self._parts[1].keys(*args, **kwargs)
+
+
+def _written(body: list[TensorDictModule], tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+    """Return what plain modules, applied in order, write."""
+    written: dict[NestedKey, Tensor] = {}
+    for module in body:
+        keys = module.in_keys
+        inputs = (written[key] if key in written else tensordict.get(key) for key in keys)
+        returned = module.module(*inputs)
+        outputs = returned if isinstance(returned, tuple) else (returned,)
+        written.update(zip(module.out_keys, outputs, strict=True))
+    return written

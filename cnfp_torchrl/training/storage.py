@@ -1,0 +1,43 @@
+"""The replay buffer of a run: what it stores of a transition, and what it computes at sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.utils import NestedKey
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+
+from cnfp_torchrl.envs import PackedStates, SampledGeometry, constraints_to_sample
+from cnfp_torchrl.keys import ACTION_KEY, CONSTRAINTS_KEY
+
+
+def prepare_buffer(
+    buffer: TensorDictReplayBuffer,
+    env: EnvBase,
+    state_keys: Sequence[NestedKey],
+    *,
+    other_keys: Sequence[NestedKey] = (),
+    constraint_bytes: int,
+) -> list[NestedKey]:
+    """Let a buffer store little of constraints; return the keys of transitions to extend it with.
+
+    What the actor reads is stored once a state (`PackedStates`), besides sets that are too large:
+    those are computed at sampling (`SampledGeometry`). Without constraints nothing is done.
+
+    Args:
+        buffer: an empty one that overwrites the oldest transitions first.
+        env: publishes what is to be stored.
+        state_keys: what the actor reads of a state.
+        other_keys: what the loss reads besides states, action, reward and ends.
+        constraint_bytes: how much of a transition may be stored for constraints.
+    """
+    computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
+    stored = [key for key in state_keys if key not in computed.field_keys]
+    state = list(dict.fromkeys([*computed.state_keys, *stored]))
+    if any(isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY for key in state):
+        buffer.append_transform(PackedStates(state, buffer.storage.max_size))
+    if computed.field_keys:
+        buffer.append_transform(computed)
+    outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
+    return [*state, ACTION_KEY, *outcome, *other_keys]

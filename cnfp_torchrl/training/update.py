@@ -1,0 +1,42 @@
+"""One step of learning: losses of a batch, their gradients, the optimizer, the targets."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch.optim import Optimizer
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import TargetNetUpdater
+
+
+class Update:
+    """Learn from a batch of transitions.
+
+    Args:
+        loss: whose outputs named ``loss_...`` are summed and descended.
+        optimizer: of the loss's parameters.
+        target: moves the loss's target networks after each step.
+        compiled: compile the loss and its backward pass, which takes a minute or more, once.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimizer: Optimizer,
+        target: TargetNetUpdater,
+        *,
+        compiled: bool = False,
+    ) -> None:
+        self.loss = loss
+        self.optimizer = optimizer
+        self.target = target
+        self._losses = torch.compile(loss) if compiled else loss
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Make one step and return what the loss returned."""
+        losses = self._losses(batch)
+        self.optimizer.zero_grad()
+        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        self.optimizer.step()
+        self.target.step()
+        return losses

@@ -1,0 +1,306 @@
+"""Time SAC updates and whole training against Stable-Baselines3, in one interleaved run.
+
+`python experiments/benchmarks/updates.py [--quick] [--parts update training] [--output FOLDER]`
+(`pip install 'cnfp_torchrl[bench]'` for Stable-Baselines3) measures, on one thread, for networks of
+width 64 and 256:
+
+- an update on a batch of 256 drawn from a full buffer, of the exact flow, of an unconstrained
+  actor, of Stable-Baselines3's unconstrained SAC, and the matrix products of such an update alone;
+- whole training in steps a second, 16 agents and half an update a step, after the warm-up: the
+  exact flow and the unconstrained actor in `cnfp_torchrl.training`, and Stable-Baselines3's SAC
+  with 16 environments of the same task in its vectorized environment.
+
+In a round all take their turn, so that another program's load falls on all of them. Reported are
+medians over rounds of the ratio to Stable-Baselines3 within a round, with the rounds' quartiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from statistics import median, quantiles
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torch import Tensor
+
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.tasks.point_nav import POINT_NAV_ID
+from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.storage import prepare_buffer
+from cnfp_torchrl.training.train import train
+from cnfp_torchrl.training.update import Update
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+REFERENCE = "Stable-Baselines3"
+PRODUCTS = "matrix products alone"
+FLOWS = {"exact flow": "exact", "unconstrained": "unconstrained"}
+AGENTS, BATCH, GAMMA, TAU, LEARNING_RATE = 16, 256, 0.95, 0.005, 1e-3
+Rounds = dict[str, list[float]]
+
+
+def composed(flow: str, width: int, *overrides: str) -> DictConfig:
+    """Return the configuration of a training run."""
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        return compose(
+            "train", overrides=[f"flow={flow}", f"network.hidden=[{width},{width}]", *overrides]
+        )
+
+
+def our_update(flow: str, width: int, *, compiled: bool = False) -> Callable[[], Any]:
+    """Return a call that draws a batch and learns from it, as training does."""
+    config = composed(flow, width)
+    env = build_environment(config)
+    actor = build_actor(config, env)
+    loss = build_loss(config, env, actor)
+    target = instantiate(config.target, _partial_=True)(loss)
+    optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
+    buffer = instantiate(config.replay_buffer)
+    steps = env.rollout(200, actor, break_when_any_done=False).detach().reshape(-1)
+    limit = config.training.constraint_bytes
+    buffer.extend(steps.select(*prepare_buffer(buffer, env, actor.in_keys, constraint_bytes=limit)))
+    update = Update(loss, optimizer, target, compiled=compiled)
+    return lambda: update(buffer.sample())
+
+
+def reference_model(width: int, learning_starts: int) -> Any:
+    """Return Stable-Baselines3's SAC on 16 environments of the same task, set as ours is."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.env_util import make_vec_env
+
+    return SAC(
+        "MlpPolicy",
+        make_vec_env(POINT_NAV_ID, n_envs=AGENTS, seed=0),
+        learning_rate=LEARNING_RATE,
+        batch_size=BATCH,
+        gamma=GAMMA,
+        tau=TAU,
+        train_freq=1,
+        gradient_steps=AGENTS // 2,
+        learning_starts=learning_starts,
+        target_entropy=-4.0,
+        policy_kwargs={"net_arch": [width, width]},
+        device="cpu",
+        seed=0,
+    )
+
+
+def reference_update(width: int) -> Callable[[], Any]:
+    """Return Stable-Baselines3's update, its batch drawn from a buffer of as many transitions."""
+    steps = 200 * AGENTS
+    model = reference_model(width, learning_starts=2 * steps)
+    model.learn(steps)
+    return lambda: model.train(gradient_steps=1, batch_size=BATCH)
+
+
+def matrix_products(width: int) -> Callable[[], None]:
+    """Return the matrix products that no SAC update can do without, forwards and backwards.
+
+    The actor on states and next states, the critics on what was done and on what the actor does,
+    the target critics on what it does next; gradients of the actor's and the critics' weights, and
+    through the critics to the action.
+    """
+    actor = _layers(5, 4, width)
+    critics = [_layers(7, 1, width) for _ in range(2)]
+    states, pairs = torch.randn(BATCH, 5), torch.randn(BATCH, 7)
+
+    def forward(layers: list[Tensor], x: Tensor) -> list[Tensor]:
+        inputs = []
+        for weight in layers:
+            inputs.append(x)
+            x = x @ weight
+        return [*inputs, x]
+
+    def backward(layers: list[Tensor], passed: list[Tensor], *, weights: bool, last: bool) -> None:
+        gradient = passed[-1]
+        for weight, x in zip(reversed(layers), reversed(passed[:-1]), strict=True):
+            if weights:
+                _ = x.mT @ gradient
+            if last or weight is not layers[0]:
+                gradient = gradient @ weight.mT
+
+    @torch.no_grad()
+    def products() -> None:
+        forward(actor, states)
+        for critic in critics:
+            forward(critic, pairs)  # targets
+            backward(critic, forward(critic, pairs), weights=True, last=False)
+            backward(critic, forward(critic, pairs), weights=False, last=True)
+        backward(actor, forward(actor, states), weights=True, last=False)
+
+    return products
+
+
+def _layers(inputs: int, outputs: int, width: int) -> list[Tensor]:
+    sizes = [inputs, width, width, outputs]
+    return [torch.randn(a, b) / a**0.5 for a, b in pairwise(sizes)]
+
+
+def time_updates(width: int, rounds: int, repeats: int, *, compiled: bool) -> Rounds:
+    """Return the milliseconds of an update of each kind in each round."""
+    calls = {name: our_update(flow, width) for name, flow in FLOWS.items()}
+    calls |= {REFERENCE: reference_update(width), PRODUCTS: matrix_products(width)}
+    if compiled:
+        calls |= {f"{n}, compiled": our_update(f, width, compiled=True) for n, f in FLOWS.items()}
+    for call in calls.values():
+        for _ in range(3):
+            call()
+    times: Rounds = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            started = time.perf_counter()
+            for _ in range(repeats):
+                call()
+            times[name].append((time.perf_counter() - started) / repeats * 1e3)
+    return times
+
+
+def our_training(flow: str, width: int, warmup: int, frames: int) -> float:
+    """Return the steps a second of a run after its warm-up, evaluation apart."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = composed(
+            flow,
+            width,
+            f"training.warmup_frames={warmup}",
+            f"training.log_interval={AGENTS}",
+            f"collector.total_frames={warmup + frames}",
+            "evaluation.episodes=1",
+            "+env.base.max_steps=100",
+            "logger=csv",
+            "figures=none",
+        )
+        path = Path(folder) / "run"
+        train(config, RunFolder.create(path))
+        with (path / "metrics" / "scalars" / "train" / "seconds.csv").open() as file:
+            rows = [(int(step), float(seconds)) for step, seconds in csv.reader(file)]
+    # The entry at the warm-up's end comes after its last step, and after that step's updates.
+    (first, started), (last, ended) = next(row for row in rows if row[0] >= warmup), rows[-1]
+    return (last - first) / (ended - started)
+
+
+def reference_training(width: int, warmup: int, frames: int) -> float:
+    """Return the steps a second of Stable-Baselines3 after its warm-up."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Clock(BaseCallback):
+        started: tuple[int, float] | None = None
+
+        def _on_step(self) -> bool:
+            if self.started is None and self.num_timesteps > warmup:
+                self.started = self.num_timesteps, time.perf_counter()
+            return True
+
+    clock, model = Clock(), reference_model(width, learning_starts=warmup)
+    model.learn(warmup + frames, callback=clock)
+    assert clock.started is not None
+    first, started = clock.started
+    return (model.num_timesteps - first) / (time.perf_counter() - started)
+
+
+def time_training(width: int, rounds: int, warmup: int, frames: int) -> Rounds:
+    """Return the steps a second of each kind of training in each round."""
+    speeds: Rounds = {name: [] for name in (*FLOWS, REFERENCE)}
+    for _ in range(rounds):
+        for name, flow in FLOWS.items():
+            speeds[name].append(our_training(flow, width, warmup, frames))
+        speeds[REFERENCE].append(reference_training(width, warmup, frames))
+    return speeds
+
+
+def summary(measured: Rounds) -> dict[str, dict[str, float]]:
+    """Return median, and ratio to Stable-Baselines3 with quartiles, of each kind."""
+    rows = {}
+    for name, values in measured.items():
+        ratios = [a / b for a, b in zip(values, measured[REFERENCE], strict=True)]
+        low, middle, high = quantiles(ratios, n=4, method="inclusive")
+        rows[name] = {"median": median(values), "ratio": middle, "low": low, "high": high}
+    return rows
+
+
+def table(rows: dict[str, dict[str, float]], unit: str) -> list[str]:
+    """Return the rows of one width as a Markdown table."""
+    lines = [f"| | {unit} | / {REFERENCE} | quartiles |", "|---|---|---|---|"]
+    for name, row in rows.items():
+        spread = f"{row['low']:.2f} to {row['high']:.2f}"
+        lines.append(f"| {name} | {row['median']:.2f} | {row['ratio']:.2f} | {spread} |")
+    return lines
+
+
+def main() -> None:
+    """Measure and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--quick", action="store_true", help="few rounds, for a test")
+    parser.add_argument("--parts", nargs="+", default=["update", "training"])
+    parser.add_argument("--widths", type=int, nargs="+", default=[64, 256])
+    parser.add_argument("--rounds", type=int, default=7, help="of training; updates take 9 times")
+    parser.add_argument("--compiled", action="store_true", help="also compiled updates: minutes")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the results")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    widths, rounds, repeats, frames = arguments.widths, arguments.rounds, 10, 1600
+    if arguments.quick:
+        widths, rounds, repeats, frames = [8], 2, 1, 2 * AGENTS
+    results: dict[str, dict[str, Any]] = {}
+    load = {"before": os.getloadavg()}
+    for width in widths:
+        if "update" in arguments.parts:
+            times = time_updates(width, 9 * rounds, repeats, compiled=arguments.compiled)
+            results[f"update, batch {BATCH}, width {width}"] = {
+                "unit": "ms",
+                "rounds": 9 * rounds,
+                "rows": summary(times),
+            }
+        if "training" in arguments.parts:
+            speeds = time_training(width, rounds, 10 * AGENTS, frames)
+            results[f"training, {AGENTS} agents, width {width}"] = {
+                "unit": "steps/s",
+                "rounds": rounds,
+                "rows": summary(speeds),
+            }
+    load["after"] = os.getloadavg()
+    packages = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "stable-baselines3")
+    about = {
+        "command": f"python experiments/benchmarks/updates.py {' '.join(sys.argv[1:])}".rstrip(),
+        "python": platform.python_version(),
+        "processor": f"{platform.machine()}, {os.cpu_count()} cores, 1 thread",
+        **{name: version(name) for name in packages},
+        "load": load,
+    }
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    document = {"about": about, "results": results}
+    (arguments.output / "updates.json").write_text(json.dumps(document, indent=1) + "\n")
+    lines = ["# Updates and training beside Stable-Baselines3", ""]
+    lines += [f"- {key}: {value}" for key, value in about.items()] + [""]
+    lines += [
+        "Medians over rounds in which all take turns; the ratio is taken within a round. Of times "
+        "less is better, of steps a second more."
+    ]
+    for title, each in results.items():
+        lines += [
+            "",
+            f"## {title} ({each['rounds']} rounds)",
+            "",
+            *table(each["rows"], each["unit"]),
+        ]
+    text = "\n".join([*lines, ""])
+    (arguments.output / "updates.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""States kept once in a replay buffer: whatever is sampled is what was stored."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from cnfp_torchrl.envs import PackedStates
+from cnfp_torchrl.envs.packed_states import POINTER_BYTES
+
+KEYS = [("constraints", "a", "low"), ("constraints", "a", "active"), ("constraints", "point"), "x"]
+
+
+def states(numbers: torch.Tensor) -> TensorDict:
+    """Entries of several dtypes and shapes, all told by a number."""
+    base = numbers.double()
+    return TensorDict(
+        {
+            "constraints": {
+                "a": {
+                    "low": (base.unsqueeze(-1) + torch.tensor([0.0, 0.5])).float(),
+                    "active": numbers % 3 == 0,
+                },
+                "point": base[:, None, None] * torch.tensor([[1.0, 2.0, 3.0]]).double(),
+            },
+            "x": numbers.to(torch.int16),
+        },
+        numbers.shape,
+    )
+
+
+def transitions(roots: torch.Tensor, afters: torch.Tensor) -> TensorDict:
+    data = states(roots)
+    data["next"] = states(afters)
+    data["number"], data["next", "number"] = roots, afters
+    return data
+
+
+def stream(agents: int, steps: int, length: int, *, horizon: int = 1) -> Iterator[TensorDictBase]:
+    """Batches ``(agents * horizon,)`` of agents whose episodes end at different times."""
+    generator = torch.Generator().manual_seed(0)
+    fresh = iter(range(1, 10**6))
+    now = torch.tensor([next(fresh) for _ in range(agents)])
+    for _ in range(steps):
+        columns = []
+        for _ in range(horizon):
+            after = torch.tensor([next(fresh) for _ in range(agents)])
+            columns.append((now, after))
+            ended = torch.rand(agents, generator=generator) < 1 / length
+            start = torch.tensor([next(fresh) for _ in range(agents)])
+            now = torch.where(ended, start, after)
+        roots, afters = (torch.stack(each, -1).flatten() for each in zip(*columns, strict=True))
+        yield transitions(roots, afters)
+
+
+def filled(batches: Iterator[TensorDictBase], size: int) -> tuple[TensorDictReplayBuffer, int]:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(size), batch_size=512)
+    buffer.append_transform(PackedStates(KEYS, size))
+    count = 0
+    for batch in batches:
+        buffer.extend(batch)
+        count += len(batch)
+        assert_right(buffer)
+    return buffer, count
+
+
+def assert_right(buffer: TensorDictReplayBuffer) -> None:
+    sample = buffer.sample()
+    for part, numbers in ((sample, sample["number"]), (sample["next"], sample["next", "number"])):
+        expected = states(numbers)
+        for key in KEYS:
+            assert part[key].dtype == expected[key].dtype
+            assert torch.equal(part[key], expected[key]), key
+
+
+@pytest.mark.parametrize("length", [1, 3, 50])
+@pytest.mark.parametrize(
+    ("agents", "size", "horizon"),
+    [(4, 64, 1), (4, 64, 5), (1, 10, 1), (1, 10, 5), (7, 50, 5), (16, 16, 1), (16, 10_000, 5)],
+)
+def test_samples_are_what_was_stored(agents: int, size: int, length: int, horizon: int) -> None:
+    filled(stream(agents, 60, length, horizon=horizon), size)
+
+
+def test_batches_of_other_sizes_and_in_another_order_are_right() -> None:
+    generator = torch.Generator().manual_seed(1)
+    batches = [
+        each[torch.randperm(len(each), generator=generator)[: 1 + index % len(each)]]
+        for index, each in enumerate(stream(6, 40, 5))
+    ]
+    filled(iter(batches), 64)
+
+
+@pytest.mark.parametrize("horizon", [1, 5])
+def test_a_state_is_stored_once(horizon: int) -> None:
+    buffer, count = filled(stream(16, 100, 50, horizon=horizon), 10_000)
+    packed = buffer._transform[0]
+    row = packed._rows.shape[-1]
+    # Two percent for the first states of episodes, and the first column of a batch of several.
+    assert packed.nbytes / row <= 1.05 * count * (1 if horizon == 1 else 1.2)
+    stored = buffer.storage.get(range(len(buffer)))
+    pointers = [value.nbytes for value in stored["state"].values()]
+    assert sum(pointers) == POINTER_BYTES * count
+    assert not set(KEYS) & set(stored.keys(True, True))
+
+
+def test_states_that_nothing_refers_to_are_dropped() -> None:
+    buffer, _ = filled(stream(8, 400, 20), 128)
+    packed = buffer._transform[0]
+    assert packed.nbytes / packed._rows.shape[-1] <= 1.3 * (128 + 2 * 8)
+
+
+def test_it_is_saved_and_loaded() -> None:
+    first, _ = filled(stream(4, 30, 5), 64)
+    second, _ = filled(stream(4, 2, 5), 64)
+    second.load_state_dict(first.state_dict())
+    assert_right(second)
+    assert sorted(second.storage.get(range(64))["number"].tolist()) == sorted(
+        first.storage.get(range(64))["number"].tolist()
+    )
+
+
+def test_another_dtype_is_refused() -> None:
+    buffer, _ = filled(stream(4, 2, 5), 64)
+    batch = next(stream(4, 1, 5))
+    batch["x"] = batch["x"].float()
+    with pytest.raises(ValueError, match=r"key 'x': expected torch.int16.*given torch.float32"):
+        buffer.extend(batch)
