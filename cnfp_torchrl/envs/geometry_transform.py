@@ -41,7 +41,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     Everything is checked here, eagerly, once a step, so that nothing has to be checked later in
     compiled code. A set must be valid in every state, also where no action keeps the constraint:
-    publish one that misses the action bounds there; the flow drops it in that state and says so.
+    publish one that misses the action bounds there; it is relaxed in that state, which is said.
     All states' sets are of one family.
 
     Args:

@@ -134,29 +134,35 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
         if self.flow.is_safe:
-            keys += [bijector.active_key for bijector in self.bijectors] + [ANCHOR_KEY]
+            keys += [bijector.active_key for bijector in self.bijectors]
+            keys += [bijector.amounts_key for bijector in self.bijectors] + [ANCHOR_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            MissingGeometryError: when geometry, anchor or active flags are missing.
+            MissingGeometryError: when geometry, anchor, active flags or relaxations are missing.
         """
         bounds = self._bounds_beside(tensordict)
         if not self.flow.reads_constraints:
-            return self.flow(bounds, [], None, None)
+            return self.flow(bounds, [])
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
         if not self.flow.is_safe:
-            return self.flow(bounds, sets, None, None)
+            return self.flow(bounds, sets)
         anchor = self._anchor(tensordict).to(self.action_dtype)
-        return self.flow(bounds, sets, anchor, self._active(tensordict))
+        relaxation = tuple(each.to(self.action_dtype) for each in self._relaxation(tensordict))
+        return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
-        """Return the region of allowed actions, for any flow; needs anchor and active flags."""
+        """Return the region of allowed actions, for any flow; needs anchor, flags, relaxations."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
-        anchor, active = self._anchor(tensordict), self._active(tensordict)
-        return Region((self._bounds_beside(tensordict), *sets), anchor, active)
+        return Region(
+            (self._bounds_beside(tensordict), *sets),
+            self._anchor(tensordict),
+            self._active(tensordict),
+            self._relaxation(tensordict),
+        )
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
@@ -203,6 +209,14 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             require(tensordict, bijector.active_key, _ANCHOR_REMEDY) for bijector in self.bijectors
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
+
+    def _relaxation(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """Return by how much the rows of each set are widened, the bounds' by nothing."""
+        amounts = [self._anchor(tensordict).new_zeros(())]
+        for bijector in self.bijectors:
+            amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
+            amounts.append(amount if bijector.row_relaxation_key else amount.unsqueeze(-1))
+        return tuple(amounts)
 
 
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):

@@ -33,20 +33,32 @@ def refuse_violations(names: Sequence[str], region: Region, action: Tensor) -> N
     """
     if bool(region.contains(action).all()):
         return
-    for stage, (name, each) in enumerate(zip(["bounds", *names], region.sets, strict=True)):
+    for stage, (name, each) in enumerate(zip(["bounds", *names], region.widened(), strict=True)):
         bad = ~each.contains(action)
-        if region.active is not None:
-            bad = bad & region.active[..., stage]
+        counts = region.counts(stage)
+        if counts is not None:
+            bad = bad & counts
         if bool(bad.any()):
             index = tuple(int(i) for i in bad.nonzero()[0])
             # In float64, as `contains`: in float32 the slack may round to 0.
             exact = each.to(torch.float64)
             slack = exact.slack(action.double())[index].item()
+            relaxed = _relaxed(region, stage, index)
             raise ConstraintViolationError(
-                f"constraint '{name}': expected an action inside its set, given "
+                f"constraint '{name}': expected an action inside its set{relaxed}, given "
                 f"{action[index].tolist()} with slack {slack:.3g} at batch index {list(index)}"
             )
     raise AssertionError("an action is outside the region but inside all of its sets")
+
+
+def _relaxed(region: Region, stage: int, index: tuple[int, ...]) -> str:
+    """Say by how much a set is relaxed in a state, if it is."""
+    if region.relaxation is None or stage == 0:
+        return ""
+    amount = region.relaxation[stage].amax(-1)
+    amount = amount.expand(torch.broadcast_shapes(amount.shape, (1,) * len(index)))
+    largest = amount[tuple(i if n > 1 else 0 for i, n in zip(index, amount.shape, strict=True))]
+    return f" widened by {largest.item():.3g}" if bool(largest > 0) else ""
 
 
 class ExecutedActionGuard(TensorDictModuleBase):

@@ -8,21 +8,19 @@ Convex Optimization, 2004, theorem 4.2.7).
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from typing import NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.slack_program import Distances, Point, Program, weigh
+from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program
 
-MAX_ITERATIONS = 1000
-"""Newton steps before the method gives up with an error; some 20 are usual, 100 rare."""
+MAX_ITERATIONS = 150
+"""Newton steps after which the best point so far must do; some 15 are usual, 50 rare."""
 
-RELATIVE_GAP = 1e-9
-"""How close bounds of the best slack come, relative to the scale, before they count as equal."""
-
-_GROWTH = 5.0
-_TRIALS = 8
+_GROWTH = 20.0
+_TRIALS = 6
 
 
 class Best(NamedTuple):
@@ -33,74 +31,84 @@ class Best(NamedTuple):
     upper_bound: Tensor
 
 
-def maximize_slack(
-    problem: Program, start: Tensor, scale: Tensor, enough: float, share: float
-) -> Best:
+Settled: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""From lower and upper bounds of the best t, and the problems' indices: which need no more work."""
+
+
+def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Settled) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
-    Stops for each problem as soon as the slack is at least `enough` and a share of the upper bound,
-    or the upper bound is below `enough`: at once where a set is so far from the bounds that its
-    Lipschitz slack says so, which Newton's method could not tell from rounding error.
+    Stops for each problem as soon as its bounds say enough: at once where a set is so far from the
+    bounds that its Lipschitz slack does, which Newton's method could not tell from rounding error.
+    Where rounding error keeps the bounds apart, the best point so far is returned: its slack is
+    true, and no more is claimed for the upper bound.
 
     Args:
         problem: B problems in float64, with rows that bound the actions on all sides.
-        start: the middles of these bounds, ``(B, d)``.
-        scale: the mean widths of these bounds, ``(B,)``.
-        enough: the smallest slack of interest.
-        share: the share of the best slack that will do, below 1.
-
-    Raises:
-        RuntimeError: when a problem is undecided after `MAX_ITERATIONS`.
+        start: points strictly inside of the inequalities of rate 0, ``(B, d)``.
+        scale: the mean widths of the bounds, ``(B,)``.
+        settled: tells which problems need no more work.
     """
     at = problem.start(start, scale)
-    # Half of the bounds' diagonal at most; outside of the bounds the slack is negative.
-    reach = scale * start.shape[-1] / 2
-    upper_bound = problem.bound_within(start, reach).clamp(min=0)
+    # The bounds' diagonal at most; outside of the bounds nothing is feasible.
+    upper_bound = problem.bound_within(start, scale * start.shape[-1])
     found = Best(start.clone(), problem.slack(start), upper_bound)
     # The eta for which the start is best in t.
     eta = _pull_on_slack(problem, at)
-    nu = problem.barrier_parameter()
+    nu = float(problem.barrier_parameter())
     left = torch.arange(len(start), device=start.device)
+    lower, upper, action = found.slack, upper_bound, at.action
     for _ in range(MAX_ITERATIONS):
-        move, squared = newton(problem, at, eta)
+        undecided = ~settled(lower, upper, left)
+        if not bool(undecided.all()):
+            found = _settle(found, left, lower, upper, action)
+            if not bool(undecided.any()):
+                return found
+            problem, left = problem.select(undecided), left[undecided]
+            lower, upper, action = lower[undecided], upper[undecided], action[undecided]
+            eta, at = eta[undecided], Point(*(each[undecided] for each in at))
+        distances = problem.distances(at)
+        slack = at.slack + problem.gained(distances)
+        action = torch.where((slack > lower).unsqueeze(-1), at.action, action)
+        lower = torch.maximum(slack, lower)
+        move, squared = newton(problem, at, distances, eta)
         # The absolute value, because a negative one is all rounding error.
         decrement = squared.abs().sqrt()
         near = decrement < 0.5
-        gap = (nu + (decrement + nu.sqrt()) * decrement / (1 - decrement)) / eta
-        upper = torch.where(near, at.slack + gap, torch.inf)
-        slack = problem.slack(at.action)
-        better = slack > found.slack[left]
-        found.action[left] = torch.where(better.unsqueeze(-1), at.action, found.action[left])
-        found.slack[left] = torch.where(better, slack, found.slack[left])
-        found.upper_bound[left] = torch.minimum(found.upper_bound[left], upper)
-        lower, upper = found.slack[left], found.upper_bound[left]
-        undecided = ~is_settled(lower, upper, scale[left], enough, share)
-        if not bool(undecided.any()):
-            return found
+        gap = (nu + (decrement + nu**0.5) * decrement / (1 - decrement)) / eta
+        upper = torch.minimum(upper, torch.where(near, at.slack + gap, torch.inf))
         at = _line_search(problem, at, move, eta, decrement)
         eta = torch.where(near, eta * _GROWTH, eta)
-        if not bool(undecided.all()):
-            problem, left = problem.select(undecided), left[undecided]
-            nu, eta = nu[undecided], eta[undecided]
-            at = Point(*(each[undecided] for each in at))
-    raise RuntimeError(
-        f"{len(left)} of {len(start)} intersections undecided after {MAX_ITERATIONS} Newton steps; "
-        f"the first has slack {found.slack[left][0]:.3g}, at most {found.upper_bound[left][0]:.3g}"
+    return _settle(found, left, lower, upper, action)
+
+
+def _settle(found: Best, index: Tensor, lower: Tensor, upper: Tensor, action: Tensor) -> Best:
+    """Return what was found with the bounds and actions of some of the problems."""
+    return Best(
+        found.action.index_copy(0, index, action),
+        found.slack.index_copy(0, index, lower),
+        found.upper_bound.index_copy(0, index, upper),
     )
 
 
-def is_settled(lower: Tensor, upper: Tensor, scale: Tensor, enough: float, share: float) -> Tensor:
-    """Tell whether bounds of the best slack say all that is asked, or cannot come much closer."""
-    gap = upper - lower
-    deep = (lower >= enough) & (gap <= (1 - share) * upper.abs())
-    return upper.isfinite() & ((upper < enough) | deep | (gap <= RELATIVE_GAP * scale))
+def newton(problem: Program, at: Point, distances: Distances, eta: Tensor) -> tuple[Point, Tensor]:
+    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``.
 
-
-def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
-    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``."""
-    distances = problem.distances(at)
-    gradient, hessian = _rows_and_cones(problem, at, distances)
+    Args:
+        problem: B problems.
+        at: strictly feasible points.
+        distances: of these points from the inequalities.
+        eta: weights of t, ``(B,)``.
+    """
+    inverse = distances.rows.reciprocal().unsqueeze(-1)
+    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
+    gradient, hessian = rows.sum(-2), rows.mT @ rows
     gradient[:, -1] -= eta
+    if problem.has_cones:
+        _add_cones(problem, at, distances, gradient, hessian)
+    if not problem.has_sums:
+        move = -_solve(hessian, gradient)
+        return Point(move[:, :-1], move[:, -1], at.terms), -(gradient * move).sum(-1)
     sums = _KinkedSums.at(problem, distances)
     own, eliminated = sums.gradients()
     hessian = hessian + sums.reduced_hessian()
@@ -110,23 +118,22 @@ def newton(problem: Program, at: Point, eta: Tensor) -> tuple[Point, Tensor]:
     return Point(move[:, :-1], move[:, -1], terms), decrement
 
 
-def _rows_and_cones(problem: Program, at: Point, s: Distances) -> tuple[Tensor, Tensor]:
-    """Return gradient and Hessian in (action, slack) of the barriers of rows and cones."""
-    inverse = weigh(problem.row_weights, s.rows, torch.reciprocal).unsqueeze(-1)
-    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
-    # Cones: -log(h^2 - |y|^2), with z half of its gradient times h^2 - |y|^2.
+def _add_cones(
+    problem: Program, at: Point, s: Distances, gradient: Tensor, hessian: Tensor
+) -> None:
+    """Add the barriers of cones, ``-log(h^2 - |y|^2)``, to gradient and Hessian in (action, t)."""
     white = problem.white(at.action)
     height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    inverse = 2 * weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
+    inverse = 2 / (s.cone_gaps * s.cone_sums)
+    # Half of the gradient times h^2 - |y|^2.
     pulled = (problem.matrices * white.unsqueeze(-1)).sum(-2)
     z = torch.cat([pulled, (height * problem.cone_rates).unsqueeze(-1)], -1)
     z = z * inverse.unsqueeze(-1)
-    gradient = rows.sum(-2) + z.sum(-2)
-    hessian = rows.mT @ rows + z.mT @ z
+    gradient += z.sum(-2)
+    hessian += z.mT @ z
     matrices = (problem.matrices * inverse.sqrt()[..., None, None]).flatten(1, 2)
     hessian[:, :-1, :-1] += matrices.mT @ matrices
     hessian[:, -1, -1] -= (inverse * problem.cone_rates.square()).sum(-1)
-    return gradient, hessian
 
 
 class _KinkedSums(NamedTuple):
@@ -147,11 +154,8 @@ class _KinkedSums(NamedTuple):
 
     @classmethod
     def at(cls, problem: Program, s: Distances) -> Self:
-        weights = problem.sum_weights.unsqueeze(-1)
-        p = weigh(weights, s.upper, torch.reciprocal)
-        q = weigh(weights, s.lower, torch.reciprocal)
-        r = weigh(problem.sum_weights, s.sums, torch.reciprocal)
-        curvature = torch.where(weights > 0, p.square() + q.square(), 1.0)
+        p, q, r = s.upper.reciprocal(), s.lower.reciprocal(), s.sums.reciprocal()
+        curvature = p.square() + q.square()
         kappa = r.square() / (1 + r.square() * curvature.reciprocal().sum(-1))
         pull = problem.upper * p.square() + problem.lower * q.square()
         return cls(problem, p, q, r, curvature, pull, r.unsqueeze(-1) - p - q, kappa)
@@ -190,11 +194,13 @@ def _joined(action: Tensor, slack: Tensor) -> Tensor:
 
 def _pull_on_slack(problem: Program, at: Point) -> Tensor:
     s = problem.distances(at)
-    height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    rows = weigh(problem.row_weights, s.rows, torch.reciprocal) * problem.row_rates
-    cones = weigh(problem.cone_weights, s.cone_gaps * s.cone_sums, torch.reciprocal)
-    sums = weigh(problem.sum_weights, s.sums, torch.reciprocal) * problem.sum_rates
-    return rows.sum(-1) + (2 * cones * height * problem.cone_rates).sum(-1) + sums.sum(-1)
+    pull = (problem.row_rates / s.rows).sum(-1)
+    if problem.has_cones:
+        height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
+        pull = pull + (2 * height * problem.cone_rates / (s.cone_gaps * s.cone_sums)).sum(-1)
+    if problem.has_sums:
+        pull = pull + (problem.sum_rates / s.sums).sum(-1)
+    return pull
 
 
 def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decrement: Tensor) -> Point:
@@ -202,7 +208,7 @@ def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decremen
     share = torch.linspace(1, 0, _TRIALS, dtype=eta.dtype, device=eta.device).unsqueeze(-1)
     steps = (1 + decrement) ** -share
     trials = at.moved(move, steps)
-    value = problem.barrier(trials) - eta * (steps * move.slack)
+    value = problem.barrier(problem.distances(trials)) - eta * (steps * move.slack)
     best = steps.gather(0, value.argmin(0, keepdim=True)).squeeze(0)
     return at.moved(move, best)
 
@@ -210,10 +216,14 @@ def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decremen
 def _solve(hessian: Tensor, right: Tensor) -> Tensor:
     """Solve with a positive definite matrix, scaled to a unit diagonal."""
     scale = hessian.diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor, failed = torch.linalg.cholesky_ex(hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2))
+    scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    factor, failed = torch.linalg.cholesky_ex(scaled)
     if bool(failed.any()):
-        # Rounding made the matrix indefinite; a shift of that size gives a descent direction.
-        shift = 1e-12 * torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        factor = torch.linalg.cholesky(hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2) + shift)
+        # Rounding made a matrix indefinite; a shift of that size gives a descent direction, and
+        # where not even that helps, the diagonal does.
+        identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+        shifted, hopeless = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
+        shifted = torch.where((hopeless > 0)[:, None, None], identity, shifted)
+        factor = torch.where((failed > 0)[:, None, None], shifted, factor)
     right = (right * scale).unsqueeze(-1)
-    return torch.cholesky_solve(right, factor).squeeze(-1) * scale
+    return (torch.cholesky_solve(right, factor).squeeze(-1) * scale).nan_to_num()
