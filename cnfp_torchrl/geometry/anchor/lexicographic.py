@@ -91,7 +91,9 @@ def lexicographic_anchor(
         searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active)
-        for each, rows in zip(relaxation, searched.relaxation, strict=True):
+        # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
+        up = 1 + 4 * torch.finfo(anchor.dtype).eps
+        for each, rows in zip(relaxation, (up * rows for rows in searched.relaxation), strict=True):
             each.view(-1, each.shape[-1]).index_copy_(0, left, rows.to(each))
     return Anchored(anchor.view(*shape, dim), active, tuple(relaxation))
 
