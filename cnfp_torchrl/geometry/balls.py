@@ -161,9 +161,13 @@ class Ellipsoid(ConstraintSet):
         return Bounds(self.center - half, self.center + half)
 
     def inflated(self, by: Tensor) -> Self:
-        # Not a share of T, which may be out of range beside a large amount.
+        # Not a share of T, which may be out of range beside a large amount. What `eroded` takes
+        # from the longer axes is added: `rounding` knows the shorter ones alone.
         unit, scale_tril = self._in_units()
-        longer = unit + by.squeeze(-1) * spectral_norm_bound(self._inverse())
+        norm = spectral_norm_bound(self._inverse())
+        eps = 2 * EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        more = 1 + eps * norm * length(scale_tril.flatten(-2))
+        longer = unit + by.squeeze(-1) * norm * more
         return type(self)(self.center, scale_tril * longer[..., None, None], validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:

@@ -150,7 +150,10 @@ class VisibleRegion(ConstraintSet):
         return type(self)(self.position, rectangles, self.step, validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        return self._grown(magnitude).amax(-1, keepdim=True) / self.step.unsqueeze(-1)
+        """Return how far `eroded` moves the boundary, infinite where it takes in the position."""
+        moved = self._grown(magnitude).amax(-1) / self.step
+        outside = self.eroded(magnitude).slack(torch.zeros_like(self.position)) > 0
+        return torch.where(outside, moved, torch.inf).unsqueeze(-1)
 
     def _grown(self, magnitude: Tensor | float) -> Tensor:
         """Return the rounding error of each rectangle's corners, ``(*batch, m)``, in length."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 import pytest
@@ -83,15 +84,12 @@ FAMILIES: dict[str, Callable[[Draw], ConstraintSet]] = {
 
 
 def valid(family: Callable[[Draw], ConstraintSet], draw: Draw) -> ConstraintSet:
-    """Return drawn sets without those that are refused by name."""
+    """Return drawn sets without those that are refused."""
     drawn, kept = family(draw), []
     for i in range(COUNT):
         one = drawn.select(torch.Size([COUNT]), torch.tensor([i]))
-        try:
+        with contextlib.suppress(GeometryError):
             one.validate()
-        except GeometryError as error:
-            assert any(f"'{name}'" in str(error) for name in one.fields())
-        else:
             kept.append(i)
     return drawn.select(torch.Size([COUNT]), torch.tensor(kept))
 
