@@ -112,12 +112,12 @@ class ConstrainedFlow(TransformedDistribution):
 
     @property
     def mode(self) -> Tensor:
-        """The deterministic action: the density's own mode has no closed form."""
+        """The deterministic action, as the density's own mode has no closed form."""
         return self.deterministic_sample
 
     @property
     def mean(self) -> Tensor:
-        """The deterministic action: the true mean has no closed form and may break a constraint.
+        """The deterministic action, as the true mean has no closed form and may break a constraint.
 
         TorchRL asks for it under `ExplorationType.MEAN`; without it, it would take the mean of 1000
         samples, which can lie outside a non-convex set.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import dropwhile
 from typing import Self
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
 from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, lexicographic_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
@@ -17,8 +18,12 @@ from cnfp_torchrl.modules import (
     ConstraintBijector,
     ConstraintPublisher,
     action_bounds,
+    appended_transforms,
     in_order,
 )
+
+UNSEEN_STEPS = (FrameSkipTransform, MultiAction, NoopResetEnv)
+"""TorchRL's transforms that take several steps of an environment for one of their own."""
 
 
 class ConstraintAnchor(Transform, ConstraintPublisher):
@@ -97,6 +102,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._refuse_unseen_steps()
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -127,6 +133,19 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                     (*batch, slacks.shape[-1]), dtype=bounds.dtype, device=observation_spec.device
                 )
         return observation_spec
+
+    def _refuse_unseen_steps(self) -> None:
+        """Refuse transforms behind this one that act in states for which it published nothing."""
+        behind = dropwhile(lambda each: each is not self, appended_transforms(self.container))
+        for each in behind:
+            if isinstance(each, UNSEEN_STEPS):
+                raise ValueError(
+                    f"{type(each).__name__}: expected inside the environment that is constrained, "
+                    "given one around it, which executes actions in states for which nobody asked "
+                    "what they allow; write constrain_env(TransformedEnv(env, "
+                    f"{type(each).__name__}(...)), ...), whose geometry must hold for all steps of "
+                    "one action"
+                )
 
     def clone(self) -> Self:
         """Return a copy without environment, which keeps the action bounds of this one's."""

@@ -42,7 +42,7 @@ class ConstraintCost(Transform):
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """The columns' names: of the indicators, or of the environment that publishes costs."""
+        """The columns' names, of the indicators, or of the environment that publishes costs."""
         if self.indicators is not None:
             return tuple(self.indicators)
         if self.parent is None:

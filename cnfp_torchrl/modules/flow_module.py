@@ -123,7 +123,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     @property
     def stage_names(self) -> list[str]:
-        """Names of the stages of `get_dist(...).stages`, in order of application."""
+        """Names of the stages of ``get_dist(...).stages``, in order of application."""
         if self.flow.is_safe:
             return ["bounds", *self.order]
         return self.order if self.flow.reads_constraints and self.order else ["bounds"]
@@ -167,8 +167,11 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
         loc, scale = (self.widened(tensordict.get(key)) for key in self.parameter_keys)
+        bijector = self.get_bijector(tensordict)
+        if self.flow.reads_constraints:
+            refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-        return self.distribution_type(base, self.get_bijector(tensordict))
+        return self.distribution_type(base, bijector)
 
     build_dist_from_params = get_dist
 
@@ -217,6 +220,28 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
             amounts.append(amount if bijector.row_relaxation_key else amount.unsqueeze(-1))
         return tuple(amounts)
+
+
+def refuse_other_batch(key: NestedKey, given: Tensor, batch: torch.Size) -> None:
+    """Refuse an entry with another batch shape than the sets: they would be broadcast amiss.
+
+    With one action for each of several agents, but one set for all of them, sets of a batch of as
+    many environments as there are agents would each be taken for another agent's.
+
+    Args:
+        key: The entry's key.
+        given: The entry, ``(*batch, d)``.
+        batch: The sets' batch shape.
+
+    Raises:
+        ValueError: naming the entry and both shapes.
+    """
+    if given.shape[:-1] != batch:
+        raise ValueError(
+            f"key {key!r}: expected the batch shape of the constraints' sets, {tuple(batch)}, "
+            f"given a tensor of shape {tuple(given.shape)}; each action needs a set of its own: "
+            "put agents into the environment's batch size, or all of their actions into one vector"
+        )
 
 
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):
