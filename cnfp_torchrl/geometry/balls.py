@@ -154,7 +154,8 @@ class Ellipsoid(ConstraintSet):
     def gauge_about(self, anchor: Tensor) -> Gauge:
         unit, scale_tril = self._in_units()
         of_ball = ball_gauge_about(_solve(scale_tril, anchor - self.center), unit)
-        return lambda direction: of_ball(_solve(scale_tril, direction))
+        # No closure: a flow's gauges are pickled with it.
+        return partial(_whitened_gauge, scale_tril, of_ball)
 
     def bounding_box(self) -> Bounds:
         half = length(self.scale_tril)
@@ -211,6 +212,10 @@ class Ellipsoid(ConstraintSet):
     def _inverse(self) -> Tensor:
         """Return ``u T^-1``, with the u of `_in_units`."""
         return solve_triangular(self._in_units()[1], self._identity(), upper=False)
+
+
+def _whitened_gauge(scale_tril: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
+    return of_ball(_solve(scale_tril, direction))
 
 
 def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
