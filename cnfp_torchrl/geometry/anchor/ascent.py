@@ -123,7 +123,7 @@ class Ascent:
         self._look()
 
     def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
-        """Take steps until all points are deep enough, and tell which are, ``(*batch,)``.
+        """Take steps until all points are deep enough or cannot be, and tell which are, ``(*batch,)``.
 
         Args:
             steps: at most so many.
@@ -134,7 +134,7 @@ class Ascent:
         for step in range(steps + 1):
             view = self._look()
             deep = (self.least >= least) & (self.least >= share * self.upper)
-            if step == steps or bool(deep.all()):
+            if step == steps or bool((deep | (self.upper < -least)).all()):
                 break
             # Those that are deep enough stay.
             self._step(view, deep)

@@ -110,10 +110,12 @@ def refined_attempt(
             largest = torch.stack([depth.amax(-1) for depth in depths]).amax(0)
             deep = ascent.run_until(steps, SHARE, largest)
             found = Attempt(ascent.point, ascent.bound, deep)
+            impossible = found.upper < -largest
         else:
             found = further_attempt(sets, depths, before, steps)
+            impossible = torch.zeros_like(found.decided)
         anchor[left], upper[left], decided[left] = found
-        hard = (~found.decided).nonzero().squeeze(-1)
+        hard = (~found.decided & ~impossible).nonzero().squeeze(-1)
         if not len(hard):
             break
         if len(hard) < len(left):
