@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import math
-from typing import NoReturn, TypeAlias
+from typing import NamedTuple, NoReturn, TypeAlias
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
 from torch.distributions.utils import _standard_normal
 
-from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
+from cnfp_torchrl.bijectors import Bijector, Stages, has_latent, well_inside
 from cnfp_torchrl.geometry import broadcast_shape
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
+
+
+class NearestLogProb(NamedTuple):
+    """Densities of the actions well inside that are nearest to given ones.
+
+    Args:
+        log_prob: The log-densities ``(*batch,)``.
+        action: The actions that they are of, ``(*batch, d)``.
+        moved: The distances to the given actions, ``(*batch,)``, in action units; 0 where the given
+            one was well inside.
+    """
+
+    log_prob: Tensor
+    action: Tensor
+    moved: Tensor
 
 
 class ConstrainedFlow(TransformedDistribution):
@@ -146,6 +161,37 @@ class ConstrainedFlow(TransformedDistribution):
         samples, which can lie outside a non-convex set.
         """
         return self.deterministic_sample
+
+    def nearest_log_prob(self, value: Tensor, depth: float = 1e-3) -> NearestLogProb:
+        """Return the density of the action well inside that is nearest to each given one.
+
+        For actions that did not come from a flow, such as demonstrations or offline data, which may
+        lie on the boundary or a hair outside: `log_prob` is -inf there, and behavior cloning on it
+        learns nothing. Nearest means along the ray from the anchor, a bijective form's counterpart
+        of alpha projection; where an action is well inside it stays, and so does its density. ::
+
+            scored = actor.get_dist(batch).nearest_log_prob(batch["action"])
+            loss = -scored.log_prob.mean()
+
+        Args:
+            value: The actions ``(*sample, *batch, d)``, finite.
+            depth: The share of the way from the anchor to the boundary at which to score what lies
+                further out, between 0 and 1; of the order of the square root of the dtype's
+                rounding error or more, for the density to be exact.
+
+        Raises:
+            ValueError: for a depth outside of (0, 1), and for actions that are not finite.
+        """
+        if not 0 < depth < 1:
+            raise ValueError(f"depth: expected a share between 0 and 1, given {depth}")
+        if not bool(value.isfinite().all()):
+            index = (~value.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"value at index {index}: expected a finite number, given {value[tuple(index)]}"
+            )
+        action = well_inside(self.bijector, value, depth)
+        moved = torch.linalg.vector_norm(value - action, dim=-1)
+        return NearestLogProb(self.log_prob(action), action, moved)
 
     def _pushed(self, latent: Tensor) -> Tensor:
         return self._kept(latent, self.bijector(_checked(latent)))

@@ -123,7 +123,7 @@ class Ascent:
         self._look()
 
     def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
-        """Take steps until all points are deep enough or cannot be, and tell which are, ``(*batch,)``.
+        """Take steps until all points are deep enough or cannot be; tell which are, ``(*batch,)``.
 
         Args:
             steps: at most so many.
