@@ -90,5 +90,5 @@ def plain(value: Tensor) -> Any:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, list):
-        return [_finite(each) for each in value]
+        return [_finite(element) for element in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -39,7 +39,10 @@ def build_environment(
         replaced["batch_size"] = batch_size
     return make_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
-        {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
+        {
+            name: instantiate(section, _convert_="all")
+            for name, section in config.env.geometry.items()
+        },
         order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
         penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
