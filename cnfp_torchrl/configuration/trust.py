@@ -91,7 +91,7 @@ def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Pa
     """Refuse a configuration that would do anything but build what it may name.
 
     Args:
-        content: plain data.
+        content: the configuration as plain data.
         trusted: further packages, modules or objects by their dotted names; what is defined in them
             may be named and gets any argument. The empty name trusts everything.
         path: the file, for the message.
@@ -180,7 +180,7 @@ class _Check:
 
     Args:
         path: the file.
-        trusted: see `require_trusted`.
+        trusted: trusted names, see `require_trusted`.
     """
 
     def __init__(self, path: Path, trusted: tuple[str, ...]) -> None:
@@ -200,7 +200,7 @@ class _Check:
             content: the value.
             position: the value's dotted position in the file.
             name: the key that it stands under, also in a list.
-            is_limited: it is an argument of a target that is not the reader's own.
+            is_limited: flag of an argument of a target that is not the reader's own.
         """
         if isinstance(content, dict):
             self.walk_mapping(content, position, is_limited=is_limited)

@@ -1,4 +1,4 @@
-"""What a run leaves behind, and how it is read back without trusting it."""
+"""The folder of a run: what training writes, and reading it back without trust."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class PointNavGeometry(GeometryTransform):
     Args:
         layout: the map; None takes the reference task.
         name: the constraint's name; None takes the usual one.
-        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
+        observation_key: key of the observation ``(*batch, 5)``, which must not be rescaled.
     """
 
     usual_name: ClassVar[str]
