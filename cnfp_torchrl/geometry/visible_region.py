@@ -230,7 +230,7 @@ class VisibleOrBox(ConstraintSet):
     r"""The visible region where `in_sight` is 1, a box of actions where it is 0.
 
     A visible region always contains the zero action or nothing. Where rounding has brought a point
-    a hair inside the margin around an obstacle, the action must lead away from it, and a box that
+    a hair inside the margin around a rectangle, the action must lead away from it, and a box that
     leaves out 0 can say so.
 
     Args:
