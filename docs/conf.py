@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.viewcode",
     # In docs/extensions.
     "api",
+    "front_page",
     "mathml",
     "names",
     "offline",
@@ -27,11 +28,10 @@ extensions = [
 
 # Pages are read from the repository's root, so that a link from one file to another leads to the
 # same place here and where the repository is browsed.
-root_doc = "docs/index"
-include_patterns = ["docs/**", "experiments/**.md"]
-exclude_patterns = [
-    each.name for each in ROOT.iterdir() if each.name not in {"docs", "experiments"}
-]
+root_doc = "README"
+include_patterns = ["README.md", "docs/**", "experiments/**.md"]
+SOURCES = {"README.md", "docs", "experiments"}
+exclude_patterns = [each.name for each in ROOT.iterdir() if each.name not in SOURCES]
 exclude_patterns += ["docs/_build", "docs/_templates"]
 templates_path = ["_templates"]
 html_theme = "furo"
