@@ -51,10 +51,12 @@ bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 mi
 bench-updates: $(STAMP) ## Time updates and training beside Stable-Baselines3 (some 10 minutes)
 	$(PY) experiments/benchmarks/updates.py $(ARGS)
 
-paper: $(STAMP) ## Repeat the paper's experiment in outputs/paper (ARGS="--methods exact --seeds 0-4")
-	$(PY) -m experiments.paper $(ARGS)
+# A run that failed is told at the end, but takes no figure from the others.
+paper: $(STAMP) ## Repeat the paper's experiment in outputs/paper, resumable (ARGS="key=value ...")
+	$(PY) -m experiments.paper.run $(ARGS); status=$$?; \
+	$(PY) -m experiments.paper.report outputs/paper && exit $$status
 
-figures: $(STAMP) ## Redraw the figures and the report of the kept data in experiments/paper
+figures: $(STAMP) ## Redraw the figures and pages of the kept records in experiments/paper
 	$(PY) -m experiments.paper.report $(ARGS)
 
 # A reference that leads nowhere, a formula that cannot be set, a page in no table of contents and

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 
 @contextmanager
@@ -37,3 +38,13 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
             partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write plain values as JSON, whole or not at all.
+
+    Raises:
+        ValueError: for infinity and NaN, which JSON has not.
+    """
+    with whole_file(path) as file:
+        file.write(f"{json.dumps(document, indent=2, allow_nan=False)}\n".encode())

@@ -41,7 +41,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     Everything is checked here, eagerly, once a step, so that nothing has to be checked later in
     compiled code. A set must be valid in every state, also where no action keeps the constraint:
-    publish one that misses the action bounds there; the flow drops it in that state and says so.
+    publish one that misses the action bounds there; it is relaxed in that state, which is said.
     All states' sets are of one family.
 
     Args:
@@ -76,10 +76,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
         the set with ``validate_args=False``: this class validates it, and names the constraint.
 
         Args:
-            tensordict: a state of any batch size; not to be changed.
+            tensordict: States of any batch size; not to be changed.
 
         Returns:
-            a set whose fields have, or broadcast to, the tensordict's batch size.
+            A set whose fields have, or broadcast to, the tensordict's batch size.
         """
 
     def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor | None:
@@ -88,8 +88,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
         It is a candidate for the anchor of the allowed actions and will be checked.
 
         Args:
-            tensordict: a state of any batch size; not to be changed.
-            allowed: what `constraint_set` returned for it.
+            tensordict: States of any batch size; not to be changed.
+            allowed: The set that `constraint_set` returned for them.
         """
         return None
 
@@ -127,7 +127,16 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 f"given an environment with {sorted(map(str, published))}"
             )
         state = observation_spec.zero()
-        allowed = self.checked_set(state)
+        try:
+            allowed = self.checked_set(state)
+            self._refuse_shapes_that_follow_the_batch(state)
+        except Exception as error:
+            error.add_note(
+                "called for the zero of the observation spec, which need not be a state of the "
+                "environment, because the shapes and dtypes of the specs are those of the set "
+                "returned for it; its values are not used, so that any will do"
+            )
+            raise
         entries = self._entries(state, allowed)
         self._refuse_slack_of_wrong_shape(allowed, state.batch_size)
         for key, value in entries.items():
@@ -211,6 +220,33 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 f"{family.__name__}; return sets of one family in all states"
             )
         allowed.validate_shapes(where)
+
+    def _refuse_shapes_that_follow_the_batch(self, state: TensorDictBase) -> None:
+        """Refuse fields that put the states' batch where something of one set belongs.
+
+        One half-space for each state, given as normals ``(*batch, d)``, reads like as many
+        half-spaces as there are states, all of them for each state.
+        """
+        if state.numel() == 0:
+            return
+        one = state.reshape(-1)[:1]
+        shapes = []
+        for size in (2, 3):
+            allowed = self.checked_set(one.expand(size).clone())
+            shapes.append(
+                {
+                    field: tuple(value.shape[value.ndim - allowed.event_dims[field] :])
+                    for field, value in allowed.fields().items()
+                }
+            )
+        for field, shape in shapes[0].items():
+            if shapes[1][field] != shape:
+                raise GeometryError(
+                    f"constraint '{self.name}', field '{field}': expected one shape of a state's "
+                    f"set whatever the batch, given {shape} for 2 states and {shapes[1][field]} "
+                    "for 3; put the batch first, and then what belongs to one set: a single "
+                    "half-space for each state has normals (*batch, 1, d) and offsets (*batch, 1)"
+                )
 
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
         zeros = next(iter(allowed.fields().values())).new_zeros(*batch, allowed.dim)

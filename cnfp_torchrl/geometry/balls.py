@@ -25,7 +25,7 @@ class Ball(ConstraintSet):
 
     Args:
         center: ``(*batch, d)``.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -34,7 +34,7 @@ class Ball(ConstraintSet):
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 0}
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
         yield "center", self.center.isinf(), "a finite center"
 
     def whiten(self, vector: Tensor) -> Tensor:
@@ -57,6 +57,13 @@ class Ball(ConstraintSet):
     def bounding_box(self) -> Bounds:
         radius = self.radius.unsqueeze(-1)
         return Bounds(self.center - radius, self.center + radius)
+
+    def inflated(self, by: Tensor) -> Self:
+        return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * (self.radius + length(self.center))).unsqueeze(-1)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
@@ -153,13 +160,23 @@ class Ellipsoid(ConstraintSet):
         half = length(self.scale_tril)
         return Bounds(self.center - half, self.center + half)
 
+    def inflated(self, by: Tensor) -> Self:
+        unit, _ = self._in_units()
+        share = 1 + by.squeeze(-1) / unit * spectral_norm_bound(self._inverse())
+        return type(self)(
+            self.center, self.scale_tril * share[..., None, None], validate_args=False
+        )
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        return (EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size()).unsqueeze(-1)
+
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = length(self.scale_tril.flatten(-2)) + length(self.center)
-        # An ellipsoid thinner than its rounding error must not turn inside out: what is left of it
-        # has no slack to speak of, so that it is dropped like an empty set.
+        # An ellipsoid thinner than its rounding error must not turn inside out. In a region it was
+        # inflated by more than that.
         unit, _ = self._in_units()
-        share = (1 - eps * (size / unit) * spectral_norm_bound(self._inverse())).clamp(min=eps)
+        relative = self._size() / unit
+        share = (1 - eps * relative * spectral_norm_bound(self._inverse())).clamp(min=eps)
         return type(self)(
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
@@ -172,6 +189,10 @@ class Ellipsoid(ConstraintSet):
         unit, scale_tril = self._in_units()
         inverse = self._inverse()
         return Cone(inverse, -_solve(scale_tril, self.center), unit, spectral_norm_bound(inverse))
+
+    def _size(self) -> Tensor:
+        """Return the size of the numbers that enter, ``(*batch,)``."""
+        return length(self.scale_tril.flatten(-2)) + length(self.center)
 
     def _identity(self) -> Tensor:
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
@@ -204,7 +225,7 @@ class TaskSpaceBall(ConstraintSet):
     Args:
         jacobian: J, ``(*batch, m, d)``, finite.
         offset: b, ``(*batch, m)``, finite.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -216,7 +237,7 @@ class TaskSpaceBall(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "jacobian", self.jacobian.isinf(), "finite elements"
         yield "offset", self.offset.isinf(), "a finite offset"
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
 
     def shape_problem(self) -> str | None:
         rows, components = self.jacobian.shape[-2], self.offset.shape[-1]
@@ -252,11 +273,22 @@ class TaskSpaceBall(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        radius = torch.sub(self.radius, self._size(magnitude), alpha=eps)
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * self._size(magnitude) / self._norm()).unsqueeze(-1)
+
+    def inflated(self, by: Tensor) -> Self:
+        radius = self.radius + by.squeeze(-1) * self._norm()
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
+        """Return the size of the numbers that enter, ``(*batch,)``."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
         terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
-        size = self.radius + length(terms)
-        radius = torch.sub(self.radius, size, alpha=eps)
-        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+        return self.radius + length(terms)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         offset = -_image(self.jacobian, center)

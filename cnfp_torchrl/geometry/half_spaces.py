@@ -22,7 +22,8 @@ class HalfSpaces(ConstraintSet):
 
     It need not be bounded. A control barrier function gives one row,
     :math:`-L_g h \cdot a \le L_f h + \alpha(h)`. A row whose normal is zero lets every action pass
-    where its offset is 0 or more, and none where it is less: there the constraint cannot hold.
+    where its offset is 0 or more, and none where it is less: there it is relaxed by as much. Rows
+    are relaxed one by one, each by a distance.
 
     Args:
         normals: ``(*batch, m, d)``, finite.
@@ -53,8 +54,21 @@ class HalfSpaces(ConstraintSet):
         return (_rows(sets.normals, action.double()) <= sets.offsets).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
+        return self.row_slacks(action).amin(-1)
+
+    def row_slacks(self, action: Tensor) -> Tensor:
+        """Return the distances to the rows' boundaries, ``(*batch, m)``."""
         rows = self.superlevel()
-        return ((rows.offsets - _rows(rows.normals, action)) / rows.rates).amin(-1)
+        return (rows.offsets - _rows(rows.normals, action)) / rows.rates
+
+    def inflated(self, by: Tensor) -> Self:
+        rows = self.superlevel()
+        return type(self)(rows.normals, rows.offsets + by * rows.rates, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        rows = self.superlevel()
+        moved = EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size(magnitude) / rows.rates
+        return moved.masked_fill(rows.offsets.isinf(), 0)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
@@ -74,11 +88,16 @@ class HalfSpaces(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        sets = self._normalized()
+        offsets = sets.offsets - eps * self._size(magnitude)
+        offsets = torch.where(sets.offsets.isinf(), sets.offsets, offsets)
+        return type(self)(sets.normals, offsets, validate_args=False)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
+        """Return the size of the numbers that enter, of normals of about unit length."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
         sets = self._normalized()
-        size = sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
-        offsets = torch.where(sets.offsets.isinf(), sets.offsets, sets.offsets - eps * size)
-        return type(self)(sets.normals, offsets, validate_args=False)
+        return sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])

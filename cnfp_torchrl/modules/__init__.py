@@ -11,6 +11,7 @@ from cnfp_torchrl.modules.actors import (
     with_reference_entropy,
 )
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
+from cnfp_torchrl.modules.exploration import refuse_exploration
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.flows import (
     ExactFlow,
@@ -64,6 +65,7 @@ __all__ = [
     "has_density",
     "in_order",
     "make_constrained_actor",
+    "refuse_exploration",
     "refuse_other_bounds",
     "refuse_violations",
     "split_at_latent",

@@ -134,35 +134,44 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return []
         keys = [key for bijector in self.bijectors for key in bijector.geometry_keys]
         if self.flow.is_safe:
-            keys += [bijector.active_key for bijector in self.bijectors] + [ANCHOR_KEY]
+            keys += [bijector.active_key for bijector in self.bijectors]
+            keys += [bijector.amounts_key for bijector in self.bijectors] + [ANCHOR_KEY]
         return keys
 
     def get_bijector(self, tensordict: TensorDictBase) -> Bijector:
         """Return the bijector of the states in a tensordict.
 
         Raises:
-            MissingGeometryError: when geometry, anchor or active flags are missing.
+            MissingGeometryError: when geometry, anchor, active flags or relaxations are missing.
         """
         bounds = self._bounds_beside(tensordict)
         if not self.flow.reads_constraints:
-            return self.flow(bounds, [], None, None)
+            return self.flow(bounds, [])
         sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
         if not self.flow.is_safe:
-            return self.flow(bounds, sets, None, None)
+            return self.flow(bounds, sets)
         anchor = self._anchor(tensordict).to(self.action_dtype)
-        return self.flow(bounds, sets, anchor, self._active(tensordict))
+        relaxation = tuple(each.to(self.action_dtype) for each in self._relaxation(tensordict))
+        return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
-        """Return the region of allowed actions, for any flow; needs anchor and active flags."""
+        """Return the region of allowed actions, for any flow; needs anchor, flags, relaxations."""
         sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
-        anchor, active = self._anchor(tensordict), self._active(tensordict)
-        return Region((self._bounds_beside(tensordict), *sets), anchor, active)
+        return Region(
+            (self._bounds_beside(tensordict), *sets),
+            self._anchor(tensordict),
+            self._active(tensordict),
+            self._relaxation(tensordict),
+        )
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
         loc, scale = (self.widened(tensordict.get(key)) for key in self.parameter_keys)
+        bijector = self.get_bijector(tensordict)
+        if self.flow.reads_constraints:
+            refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-        return self.distribution_type(base, self.get_bijector(tensordict))
+        return self.distribution_type(base, bijector)
 
     build_dist_from_params = get_dist
 
@@ -203,6 +212,36 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             require(tensordict, bijector.active_key, _ANCHOR_REMEDY) for bijector in self.bijectors
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
+
+    def _relaxation(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        """Return by how much the rows of each set are widened, the bounds' by nothing."""
+        amounts = [self._anchor(tensordict).new_zeros(())]
+        for bijector in self.bijectors:
+            amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
+            amounts.append(amount if bijector.row_relaxation_key else amount.unsqueeze(-1))
+        return tuple(amounts)
+
+
+def refuse_other_batch(key: NestedKey, given: Tensor, batch: torch.Size) -> None:
+    """Refuse an entry with another batch shape than the sets: they would be broadcast amiss.
+
+    With one action for each of several agents, but one set for all of them, sets of a batch of as
+    many environments as there are agents would each be taken for another agent's.
+
+    Args:
+        key: The entry's key.
+        given: The entry, ``(*batch, d)``.
+        batch: The sets' batch shape.
+
+    Raises:
+        ValueError: naming the entry and both shapes.
+    """
+    if given.shape[:-1] != batch:
+        raise ValueError(
+            f"key {key!r}: expected the batch shape of the constraints' sets, {tuple(batch)}, "
+            f"given a tensor of shape {tuple(given.shape)}; each action needs a set of its own: "
+            "put agents into the environment's batch size, or all of their actions into one vector"
+        )
 
 
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):

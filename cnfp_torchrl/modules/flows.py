@@ -41,16 +41,20 @@ class Flow(ABC):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        anchor: Tensor | None,
-        active: Tensor | None,
+        anchor: Tensor | None = None,
+        active: Tensor | None = None,
+        relaxation: tuple[Tensor, ...] | None = None,
     ) -> Bijector:
         """Return the bijector.
 
         Args:
             bounds: the action bounds.
             sets: the constraints' sets in order of application.
-            anchor: a point strictly inside all active sets, ``(*batch, d)``; for exact flows.
+            anchor: a point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact
+                flows.
             active: which of bounds and sets hold, ``(*batch, K + 1)``; for exact flows.
+            relaxation: by how much the rows of bounds and sets are widened, ``(*batch, m)`` each;
+                for exact flows. None means that sets which do not hold are dropped.
         """
 
 
@@ -67,11 +71,12 @@ class RegionFlow(Flow):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        anchor: Tensor | None,
-        active: Tensor | None,
+        anchor: Tensor | None = None,
+        active: Tensor | None = None,
+        relaxation: tuple[Tensor, ...] | None = None,
     ) -> Bijector:
         assert anchor is not None
-        region = Region((bounds, *sets), anchor, active, validate_args=False)
+        region = Region((bounds, *sets), anchor, active, relaxation, validate_args=False)
         return self.onto(region)
 
 
@@ -116,8 +121,9 @@ class SquashFlow(Flow):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        anchor: Tensor | None,
-        active: Tensor | None,
+        anchor: Tensor | None = None,
+        active: Tensor | None = None,
+        relaxation: tuple[Tensor, ...] | None = None,
     ) -> Bijector:
         if not sets:
             return paper_squash(bounds)
@@ -160,8 +166,9 @@ class UnconstrainedFlow(Flow):
         self,
         bounds: Box,
         sets: Sequence[ConstraintSet],
-        anchor: Tensor | None,
-        active: Tensor | None,
+        anchor: Tensor | None = None,
+        active: Tensor | None = None,
+        relaxation: tuple[Tensor, ...] | None = None,
     ) -> BoxSquash:
         return BoxSquash(bounds.low, bounds.high, validate_args=False)
 

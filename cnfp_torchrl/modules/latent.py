@@ -29,7 +29,7 @@ from torchrl.modules import (
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.keys import LATENT_KEY, LATENT_LOG_PROB_KEY, require
 from cnfp_torchrl.modules.actors import actor_modules, flow_head
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, refuse_other_batch
 
 
 class FlowMap(TensorDictModuleBase):
@@ -65,6 +65,8 @@ class FlowMap(TensorDictModuleBase):
                 f"components, as the action has, given shape {tuple(latent.shape)}"
             )
         bijector = self.head.get_bijector(tensordict)
+        if self.head.flow.reads_constraints:
+            refuse_other_batch(self.latent_key, latent, bijector.shape[:-1])
         return tensordict.set(self.head.action_key, bijector(self.head.widened(latent)))
 
 

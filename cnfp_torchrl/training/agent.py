@@ -32,30 +32,23 @@ def build_environment(
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
-
-    Raises:
-        ValueError: when the environment has no geometry of the name ``flow.obstacle``.
     """
-    _require_obstacle(config)
-    flow: Flow = instantiate(config.flow.combine)
+    flow: Flow = instantiate(config.flow)
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
     return make_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
         {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
-        order=list(config.flow.order),
+        order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
         penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
     )
 
 
-def _require_obstacle(config: DictConfig) -> None:
-    choices = config.env.get("obstacle_geometry")
-    if choices is not None and config.flow.obstacle not in choices:
-        raise ValueError(
-            f"flow.obstacle: expected one of {list(choices)}, given {config.flow.obstacle!r}"
-        )
+def application_order(config: DictConfig) -> list[str]:
+    """Return the constraints in order of application: ``env.order``, else that of the geometry."""
+    return list(config.env.get("order", config.env.geometry))
 
 
 def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
@@ -66,8 +59,8 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
         instantiate(config.network.actor, observation_size, action_size),
         bijectors=constraint_bijectors(env) if config.env.geometry else [],
         spec=env.action_spec_unbatched,
-        order=list(config.flow.order),
-        flow=instantiate(config.flow.combine),
+        order=application_order(config),
+        flow=instantiate(config.flow),
     )
 
 

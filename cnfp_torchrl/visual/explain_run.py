@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.callbacks import replay_episodes
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
-from cnfp_torchrl.training.watching import replay_episodes
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.facts import facts_of
 from cnfp_torchrl.visual.replay import replay_step

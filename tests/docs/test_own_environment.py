@@ -4,12 +4,12 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
 from cnfp_torchrl.visual import run_figures
+from tests.entry_points import load_command
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "own_environment.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
@@ -40,11 +40,10 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
 def run(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
     """Run a command, with fewer steps than it says, and return its exit status."""
     command, *arguments = shlex.split(line)
-    (script,) = entry_points(group="console_scripts", name=command)
     monkeypatch.setattr(sys, "argv", [command, *arguments, *SHORTER[command]])
     sys.modules.pop(MODULE.stem, None)
     try:
-        script.load()()
+        load_command(command)()
     except SystemExit as ended:
         return int(ended.code or 0)
     return 0
@@ -83,7 +82,9 @@ def test_the_document_runs(
 
 
 def test_the_lines_are_counted() -> None:
-    needed = [next(body for kind, body in BLOCKS if kind == each) for each in ("python", "yaml")]
+    needed = [
+        next(body for kind, body in BLOCKS if kind == language) for language in ("python", "yaml")
+    ]
     lines = [line for body in needed for line in body.splitlines() if line]
     assert f"takes {len(lines)} lines of Python and YAML" in " ".join(DOCUMENT.read_text().split())
 

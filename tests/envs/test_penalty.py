@@ -50,9 +50,16 @@ def test_a_reset_starts_from_zero() -> None:
     assert torch.equal(after["raw_reward"][1:], state["raw_reward"][1:])
 
 
-@pytest.mark.parametrize("penalty", [0.0, -100.0, float("nan"), float("inf")])
+def test_no_penalty_leaves_the_reward_alone() -> None:
+    env = TransformedEnv(PointNavEnv([64], seed=0), Compose(RewardPenalty(0)))
+    steps = env.rollout(50, break_when_any_done=False)["next"]
+    assert steps["cost"].any()
+    assert torch.equal(steps["reward"], steps["raw_reward"])
+
+
+@pytest.mark.parametrize("penalty", [-100.0, float("nan"), float("inf")])
 def test_a_bad_penalty_is_refused(penalty: float) -> None:
-    with pytest.raises(ValueError, match="penalty: expected a number > 0, given"):
+    with pytest.raises(ValueError, match="penalty: expected a number >= 0, given"):
         RewardPenalty(penalty)
 
 

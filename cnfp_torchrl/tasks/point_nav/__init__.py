@@ -1,5 +1,6 @@
 """Constrained 2D point navigation, the task of the paper: environment, geometry, pictures."""
 
+from cnfp_torchrl.tasks.point_nav.baselines import ShortestPathPolicy
 from cnfp_torchrl.tasks.point_nav.dynamics import PointNavDynamics, State, Transition
 from cnfp_torchrl.tasks.point_nav.env import PointNavEnv
 from cnfp_torchrl.tasks.point_nav.geometry import BatteryGeometry, ObstacleGeometry
@@ -20,6 +21,7 @@ __all__ = [
     "PointNavEnv",
     "PointNavGymnasiumEnv",
     "ShortestPath",
+    "ShortestPathPolicy",
     "State",
     "Transition",
     "VisibleObstacleGeometry",

@@ -56,7 +56,7 @@ class Watch:
         self._samples = samples
         self._projections = projections
 
-    def of_training(
+    def for_training(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
     ) -> WatchedTraining:
         """Return a watcher of a training run that records into a file.
@@ -71,7 +71,7 @@ class Watch:
 
         return WatchedTraining(recording, self._stream(recording, actor, env, self.every), episodes)
 
-    def of_episodes(
+    def for_evaluation(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
     ) -> WatchedEpisodes:
         """Return a watcher of episodes that records into a file.
@@ -161,15 +161,15 @@ class WatchedTraining:
         self, recording: Recording, stream: FlowStream, episodes: Callable[[int], EpisodeStream]
     ) -> None:
         self.loggers = [_SeededLogger("recording", stream=recording.stream)]
-        self.see = StreamHook(stream)
+        self.on_batch = StreamHook(stream)
         self._recording = recording
         self._make_episodes = episodes
         self._episodes: EpisodeStream | None = None
 
-    def see_episode(self, episode: Sequence[TensorDictBase]) -> None:
+    def on_episode(self, episode: Sequence[TensorDictBase]) -> None:
         """Stream the transitions of an episode, behind all that was seen before."""
         if self._episodes is None:
-            self._episodes = self._make_episodes(self.see.frames)
+            self._episodes = self._make_episodes(self.on_batch.frames)
         self._episodes(episode)
 
     def close(self) -> None:
@@ -187,7 +187,7 @@ class WatchedEpisodes:
 
     def __init__(self, recording: Recording, episodes: EpisodeStream) -> None:
         self._recording = recording
-        self.see = episodes
+        self.on_episode = episodes
 
     def close(self) -> None:
         """Finish the recording, when whoever looks at it has seen enough."""
