@@ -20,10 +20,10 @@ extensions = [
     "sphinx.ext.viewcode",
     # In docs/extensions.
     "api",
-    "front_page",
     "mathml",
     "names",
     "offline",
+    "pages",
 ]
 
 # Pages are read from the repository's root, so that a link from one file to another leads to the
@@ -45,12 +45,15 @@ html_math_renderer = "mathml"
 
 # Every reference leads somewhere: `make docs` turns what is found here into errors.
 nitpicky = True
+# It stands in type stubs alone.
+nitpick_ignore = [("py:class", "DataclassInstance")]
 default_role = "py:obj"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True
 # An override without a docstring says nothing that its base class does not say.
 autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
