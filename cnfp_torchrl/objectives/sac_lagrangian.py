@@ -73,6 +73,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         state_action_cost: NestedKey = "state_action_cost"
 
     default_keys = _AcceptedKeys
+    _value_keys = ConstrainedSACLoss._value_keys | {"cost_network": "state_action_cost"}
 
     cost_network: TensorDictModule
     cost_network_params: TensorDictParams
