@@ -78,7 +78,7 @@ class ConstraintBijector(TensorDictModuleBase):
 
     @property
     def amounts_key(self) -> NestedKey:
-        """Where the amounts are by which a flow widens the set: row by row if there are rows."""
+        """Where the amounts are by which a flow widens the set, row by row if there are rows."""
         return self.row_relaxation_key or self.relaxation_key
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:

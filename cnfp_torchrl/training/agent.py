@@ -27,10 +27,10 @@ def build_environment(
     """Return the environment of a configuration.
 
     Args:
-        config: with sections ``env`` and ``flow``.
-        batch_size: replaces the batch size of environments that have one.
+        config: configuration with the sections ``env`` and ``flow``.
+        batch_size: batch size of environments that have one; None takes that of the configuration.
         with_anchor: publish anchor and active flags also where the flow does not need them.
-        with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
+        with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
     """
     flow: Flow = instantiate(config.flow)
@@ -39,7 +39,10 @@ def build_environment(
         replaced["batch_size"] = batch_size
     return make_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
-        {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
+        {
+            name: instantiate(section, _convert_="all")
+            for name, section in config.env.geometry.items()
+        },
         order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
         penalty=_penalty(config) if with_penalty else None,
@@ -116,7 +119,7 @@ def load_actor(
 
     Args:
         folder: the run.
-        config: its configuration, from `RunFolder.load_config`.
+        config: the run's configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
 
     Raises:

@@ -99,7 +99,7 @@ def show_episodes(
     Args:
         folder: a finished run.
         settings: those of the evaluation that the episodes are part of.
-        factory: makes the callback.
+        factory: the maker of the callback.
         recording: the file to record into.
         trusted: see `RunFolder.load_config`.
     """

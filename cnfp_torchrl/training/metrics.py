@@ -1,4 +1,4 @@
-"""What a run counts and writes down while it trains."""
+"""Counts and log of a training run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 
 class Metrics:
-    """Count returns and violations over a run, log scalars, and move the progress bar.
+    """Counts of returns and violations, the log of scalars, and the progress bar.
 
     Args:
         loggers: TorchRL loggers; each scalar goes to all of them.
