@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
-from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
 from cnfp_torchrl.modules import Flow, make_constrained_actor
 from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
 from cnfp_torchrl.training.environment import counted_constraints, make_environment
@@ -45,8 +45,16 @@ def build_environment(
         },
         order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
-        penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
+        penalty=_penalty(config) if with_penalty else None,
     )
+
+
+def _penalty(config: DictConfig) -> RewardPenalty | None:
+    """Return what violations cost in training; a number serves as well, and 0 is none."""
+    penalty = config.env.get("penalty")
+    if isinstance(penalty, int | float):
+        return RewardPenalty(penalty) if penalty else None
+    return instantiate(penalty)
 
 
 def application_order(config: DictConfig) -> list[str]:

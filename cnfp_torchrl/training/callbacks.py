@@ -139,7 +139,9 @@ def replay_episodes(
         deterministic: take the deterministic policy and not the stochastic one.
     """
     recorder = EpisodeRecorder(numbers)
-    evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic, on_step=recorder)
+    evaluate_seeded(
+        env, guarded(actor, env), settings, deterministic=deterministic, on_step=recorder
+    )
     return list(recorder.episodes.values())
 
 

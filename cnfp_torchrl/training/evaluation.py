@@ -242,8 +242,8 @@ def evaluate_run(
     exact = flow_head(safe)
     score = instantiate(config.env.get("score"))
     policies: dict[str, tuple[Policy, bool]] = {
-        "trained, stochastic": (guarded(actor), False),
-        "trained, deterministic": (guarded(actor), True),
+        "trained, stochastic": (guarded(actor, env), False),
+        "trained, deterministic": (guarded(actor, env), True),
         "safe random": (SafeRandomPolicy(safe), False),
         "standing still": (StandStill(exact), False),
     }

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.record.loggers import Logger
+from torchrl.record.loggers import Logger, TensorboardLogger
 from tqdm import tqdm
 
 
@@ -84,6 +84,9 @@ class Metrics:
         if self.frames > self._logged_at:
             self._log_entry()
         self._bar.close()
+        for logger in self._loggers:
+            if isinstance(logger, TensorboardLogger):
+                logger.close()  # ends its thread, which would outlive the run
 
     def _log_entry(self) -> None:
         self._logged_at = self.frames
