@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    largest_value,
+)
 from cnfp_torchrl.geometry.norms import power_of_two
 from cnfp_torchrl.geometry.superlevel import Rows
 
@@ -38,6 +44,9 @@ class HalfSpaces(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
+        size, most = self.normals.abs().amax(-1), largest_value(self.dtype)
+        far = (-self.offsets / most > size) & (size > 0)
+        yield "offsets", far, f"an offset above {-most:g} times the normal's largest element"
 
     def shape_problem(self) -> str | None:
         rows, offsets = self.normals.shape[-2], self.offsets.shape[-1]
@@ -66,9 +75,10 @@ class HalfSpaces(ConstraintSet):
         return type(self)(rows.normals, rows.offsets + by * rows.rates, validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        rows = self.superlevel()
-        moved = EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size(magnitude) / rows.rates
-        return moved.masked_fill(rows.offsets.isinf(), 0)
+        rows, eps = self.superlevel(), EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
+        size = rows.normals.abs().sum(-1) * largest.unsqueeze(-1) + rows.offsets.abs()
+        return (eps * size / rows.rates).masked_fill(rows.offsets.isinf(), 0)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
@@ -88,16 +98,11 @@ class HalfSpaces(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        sets = self._normalized()
-        offsets = sets.offsets - eps * self._size(magnitude)
-        offsets = torch.where(sets.offsets.isinf(), sets.offsets, offsets)
-        return type(self)(sets.normals, offsets, validate_args=False)
-
-    def _size(self, magnitude: Tensor | float) -> Tensor:
-        """Return the size of the numbers that enter, of normals of about unit length."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
         sets = self._normalized()
-        return sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
+        size = sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
+        offsets = torch.where(sets.offsets.isinf(), sets.offsets, sets.offsets - eps * size)
+        return type(self)(sets.normals, offsets, validate_args=False)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])

@@ -81,6 +81,8 @@ class Ascent:
         self.middle, self.half = self._last(middle), self._last(half)
         self.x = (self._last(start) - self.middle) / self.half
         self.upper = self._last(upper, 0)
+        self.least = torch.full_like(self.upper, -torch.inf)
+        self.sees_all = all(type(each).part_near is ConstraintSet.part_near for each in sets)
         boxes = [each for each in sets if isinstance(each, Box)]
         high = [self._last(each.high - middle) for each in boxes]
         low = [self._last(middle - each.low) for each in boxes]
@@ -98,6 +100,8 @@ class Ascent:
                 self.cones.append(self._cone(part, middle, half))
             elif isinstance(part, KinkedSum):
                 self.sums.append(self._sum(part))
+            elif not isinstance(each, Box):
+                self.sees_all = False
         if rows:
             self.normals = torch.cat([normal for normal, _ in rows])
             self.offsets = torch.cat([offset for _, offset in rows])
@@ -117,6 +121,24 @@ class Ascent:
         for _ in range(steps):
             self._step(self._look())
         self._look()
+
+    def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
+        """Take steps until all points are deep enough or cannot be; tell which are, ``(*batch,)``.
+
+        Args:
+            steps: at most so many.
+            share: of the best slack that will do.
+            depth: the least slack that will do, ``(*batch,)``.
+        """
+        least = self._last(depth, 0)
+        for step in range(steps + 1):
+            view = self._look()
+            deep = (self.least >= least) & (self.least >= share * self.upper)
+            if step == steps or bool((deep | (self.upper < -least)).all()):
+                break
+            # Those that are deep enough stay.
+            self._step(view, deep)
+        return deep.view(self.shape)
 
     def _look(self) -> _View:
         step = self.half * self.x
@@ -139,7 +161,7 @@ class Ascent:
             values.append((size - (side * at).sum(0)).unsqueeze(0))
             gradients.append((-side * self.half).unsqueeze(0))
         value = torch.cat(values) if len(values) > 1 else values[0]
-        least = value.amin(0)
+        least = self.least = value.amin(0)
         tiny = torch.finfo(least.dtype).eps * self.half.amin(0)
         gap = torch.add(tiny, (self.upper - least).relu(), alpha=LEVEL)
         inverse = (value - (least - gap)).reciprocal()
@@ -160,7 +182,7 @@ class Ascent:
             curvature.append((rest[place] * bend) * (cone.square - along))
         return _View(inverse, gradient, pull, curvature)
 
-    def _step(self, view: _View) -> None:
+    def _step(self, view: _View, stays: Tensor | None = None) -> None:
         above, below, rest = view.inverse.split(
             [self.dim, self.dim, len(view.inverse) - 2 * self.dim]
         )
@@ -179,6 +201,9 @@ class Ascent:
             changes.append((view.gradient * move).sum(1))
         fall = (torch.cat(changes) * view.inverse).amin(0)
         share = (-FALL / fall.clamp(max=-1e-3)).clamp(max=LONGEST)
+        if stays is not None:
+            share = share.masked_fill(stays, 0)
+            move = move.nan_to_num()
         self.x = torch.addcmul(self.x, share, move)
 
     def _rows(self, part: Rows, middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 STEPS = 6
 """Steps inwards: more decide tighter states, which the search takes otherwise."""
 
-REFINEMENTS = (3, 3, 4)
+REFINEMENTS = (4, 3, 5)
 """Steps inwards between looks at which states need more of them."""
 
 SHARE = 0.3
@@ -105,9 +105,17 @@ def refined_attempt(
     anchor, upper, decided = (each.clone() for each in before)
     left = torch.arange(len(decided), device=decided.device)
     for steps in REFINEMENTS:
-        found = further_attempt(sets, depths, before, steps)
+        ascent = Ascent(sets, before.anchor, before.upper)
+        if ascent.sees_all:
+            largest = torch.stack([depth.amax(-1) for depth in depths]).amax(0)
+            deep = ascent.run_until(steps, SHARE, largest)
+            found = Attempt(ascent.point, ascent.bound, deep)
+            impossible = found.upper < -largest
+        else:
+            found = further_attempt(sets, depths, before, steps)
+            impossible = torch.zeros_like(found.decided)
         anchor[left], upper[left], decided[left] = found
-        hard = (~found.decided).nonzero().squeeze(-1)
+        hard = (~found.decided & ~impossible).nonzero().squeeze(-1)
         if not len(hard):
             break
         if len(hard) < len(left):

@@ -194,13 +194,21 @@ class Search:
                 return (lower >= near) | (upper - lower <= near)
 
             best = some.maximize(needs, tried, counts[left] | tried, self.kept[left], settled)
-            self.kept[left] = best.action
             rooms = some.row_slacks(best.action) - needs
             least = torch.where(tried, rooms, torch.inf).amin(-1)
             gives = least <= wanted / 4
             binding = tried & (rooms <= (least + 5 * wanted).unsqueeze(-1)) & gives.unsqueeze(-1)
             amount = (self.leeway[left] - least).unsqueeze(-1)
             self.relaxation[left] = torch.where(binding, amount, self.relaxation[left])
+            # Back towards where it came from, by what half of the leeway allows: Newton's method is
+            # slow to leave the boundaries that the best point lies on.
+            before = self.kept[left]
+            short = least - torch.where(binding, some.row_slacks(before) - needs, torch.inf).amin(
+                -1
+            )
+            share = (self.leeway[left] / (2 * self.leeway[left] + 2 * short.relu())).unsqueeze(-1)
+            share = torch.where(gives.unsqueeze(-1), share, 0.0)
+            self.kept[left] = best.action + share * (before - best.action)
             counts[left] = counts[left] | binding
             trial[left] = tried & ~binding & gives.unsqueeze(-1)
 
