@@ -18,6 +18,8 @@ from cnfp_torchrl.tasks.point_nav.dynamics import (
     State,
 )
 from cnfp_torchrl.tasks.point_nav.layout import EPISODE_STEPS, Layout
+from cnfp_torchrl.tasks.point_nav.task_view import PointNavView
+from cnfp_torchrl.tasks.task_view import TaskView
 
 
 class PointNavEnv(EnvBase):
@@ -97,6 +99,10 @@ class PointNavEnv(EnvBase):
     def state(self) -> State:
         """The current state; the tensors are never changed in place."""
         return State(self.position, self.battery, self.goal)
+
+    def task_view(self, env: EnvBase) -> TaskView:
+        """Return what this task shows of itself; ``env`` is this one with all its transforms."""
+        return PointNavView(self.layout, env)
 
     def to(self, device: torch.device | str) -> PointNavEnv:
         """Move the environment; the random numbers of another device differ."""
