@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from cnfp_torchrl.visual import run_figures
-
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "own_environment.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
 MODULE, CONFIG = Path("my_pendulum.py"), Path("conf/env/my_pendulum.yaml")
@@ -20,6 +18,7 @@ SHORTER = {
         "training.warmup_frames=32",
         "training.update_ratio=0.1",
         "evaluation.episodes=4",
+        "+figures.states=4",
     ],
     "cnfp-evaluate": ["evaluation.episodes=2"],
     "cnfp-explain": [],
@@ -31,7 +30,6 @@ SHORTER = {
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(run_figures, "_STATES", 4)
     CONFIG.parent.mkdir(parents=True)
     yield tmp_path
     sys.modules.pop(MODULE.stem, None)

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors import Bijector
-from cnfp_torchrl.visual.canvas import house_style, new_figure
 from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
+from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.outlines import Line, View
 
 PARTICLES = "cividis"

@@ -17,7 +17,7 @@ import torch
 import yaml
 
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
-from cnfp_torchrl.visual import read_scalars
+from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper.afterwards import evaluate_afterwards
 from experiments.paper.records import Outcome, Record, Series
 

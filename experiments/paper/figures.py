@@ -7,7 +7,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper.figures_comparison import draw_afterwards, draw_summary, draw_trade_off
 from experiments.paper.figures_flow import KeptPolicy, flow_figures
 from experiments.paper.figures_hostile import draw_hostile

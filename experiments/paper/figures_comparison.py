@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from cnfp_torchrl.visual.canvas import house_style, message_figure, new_figure
 from cnfp_torchrl.visual.comparison import (
     Estimate,
     count_axis,
@@ -17,6 +16,7 @@ from cnfp_torchrl.visual.comparison import (
     draw_rows_apart,
     spread_labels,
 )
+from cnfp_torchrl.visual.figures.canvas import house_style, message_figure, new_figure
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import Outcome, Record
 from experiments.paper.statistics import (

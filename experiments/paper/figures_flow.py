@@ -24,12 +24,14 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
-from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.tasks.task_view import find_task_view
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
-from cnfp_torchrl.visual import FlowSnapshot, flow_stages, take_snapshot
-from cnfp_torchrl.visual.banner import flow_banner
+from cnfp_torchrl.visual import FlowSnapshot, explain, take_snapshot
+from cnfp_torchrl.visual.figures import flow_stages
+from experiments.figures.banner import flow_banner
 from experiments.paper.fields import Fields
 
 KEPT = Path(__file__).parent / "policy.json"
@@ -180,15 +182,13 @@ def save_policy(policy: KeptPolicy, path: Path) -> None:
 def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
     """Return the flow on the map, and the permissive and the restrictive state."""
     flow, permissive, restrictive = (snapshot(policy, name) for name in PLACES)
-    layout = Layout()
+    view = find_task_view(PointNavEnv())
     restrictive = restrictive.following_the_longest_path()
     return {
-        "flow": flow_banner(flow, layout),
-        "permissive": flow_stages(
-            permissive, layout=layout, title=_title("Permissive", permissive)
-        ),
+        "flow": flow_banner(flow, view),
+        "permissive": flow_stages(permissive, view=view, title=_title("Permissive", permissive)),
         "restrictive": flow_stages(
-            restrictive, layout=layout, title=_title("Restrictive", restrictive)
+            restrictive, view=view, title=_title("Restrictive", restrictive)
         ),
     }
 
@@ -213,7 +213,9 @@ def _reset(env: TransformedEnv, place: Place) -> TensorDictBase:
 
 
 def _title(kind: str, drawn: FlowSnapshot) -> str:
-    return f"{kind} state: {100 * drawn.allowed_share():.0f} % of the actions are allowed"
+    share = explain(drawn).share_allowed
+    assert share is not None
+    return f"{kind} state: {100 * share:.0f} % of the actions are allowed"
 
 
 def main() -> None:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual.canvas import house_style, new_figure
 from cnfp_torchrl.visual.comparison import count_axis, draw_estimates, draw_rows_apart
+from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from experiments.paper.hostile import HostileRun, by_flow
 from experiments.paper.labels import in_order, label
 

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual.canvas import house_style, new_figure
 from cnfp_torchrl.visual.comparison import Look, count_axis, draw_band, legend_below, step_axis
+from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import RETURN, VIOLATIONS, Record, Series
 from experiments.paper.statistics import band, by_method, round_ends

@@ -126,7 +126,9 @@ def provenance(runs: Runs) -> str:
             f"`experiment={method}`",
             ", ".join(str(run.seed) for run in records),
             _all_of(f"{run.steps:,}" for run in records),
-            _all_of(" ".join(f"`{o}`" for o in run.overrides) or "none" for run in records),
+            _all_of(
+                " ".join(f"`{o}`" for o in run.overrides) or "unconstrained" for run in records
+            ),
             _all_of(in_words(_shared(every[0]), _shared(run)) for run in records),
         ]
         for method, records in runs.items()

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual import read_scalars
+from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper import collect as collecting
 from experiments.paper.collect import collect, commit, settings
 from experiments.paper.records import load_records

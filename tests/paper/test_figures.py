@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual import banner, density
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual import explain
 from cnfp_torchrl.visual.comparison import Look
+from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper import statistics
 from experiments.paper.fields import RecordError
 from experiments.paper.figures import FIGURES, draw_figures
@@ -48,8 +48,6 @@ NO_SCALE, FLAT = {"loc": [0, 0]}, {"loc": [0, 0], "scale": [1, 0]}
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(statistics, "RESAMPLES", 100)
-    monkeypatch.setattr(banner, "_COUNTED", 100_000)
-    monkeypatch.setattr(density, "_NODES", 41)
 
 
 def test_all_figures(tmp_path: Path) -> None:
@@ -128,7 +126,7 @@ def test_mappings_map_into_their_sets() -> None:
 
 
 def test_places_are_what_they_are_called() -> None:
-    shares = {name: snapshot(UNTRAINED, name).allowed_share() for name in PLACES}
+    shares = {name: explain(snapshot(UNTRAINED, name)).share_allowed for name in PLACES}
     assert shares["permissive"] == 1
     assert shares["restrictive"] < 0.5
     for name in ("flow", "restrictive"):

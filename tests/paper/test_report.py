@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual import banner, density
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper import figures, intersections, statistics
 from experiments.paper.claims import AIMS, BASELINE_CLAIMS, FLOW_CLAIMS
 from experiments.paper.figures_flow import UNTRAINED
@@ -30,8 +29,6 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(figures, "save_png", save)
     monkeypatch.setattr(statistics, "RESAMPLES", 200)
-    monkeypatch.setattr(banner, "_COUNTED", 100_000)
-    monkeypatch.setattr(density, "_NODES", 41)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -166,6 +163,6 @@ def test_what_is_wrong_is_named_and_left_out(tmp_path: Path) -> None:
 
 
 def test_no_record_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--data", str(tmp_path / "none"), "--output", str(tmp_path)]) == 1
+    assert main(["--data", str(tmp_path / "unconstrained"), "--output", str(tmp_path)]) == 1
     assert "expected a record or more" in capsys.readouterr().err
     assert not (tmp_path / "README.md").exists()

@@ -7,7 +7,6 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from cnfp_torchrl.visual.canvas import new_figure
 from cnfp_torchrl.visual.comparison import (
     Estimate,
     Look,
@@ -18,6 +17,7 @@ from cnfp_torchrl.visual.comparison import (
     spread_labels,
     step_axis,
 )
+from cnfp_torchrl.visual.figures.canvas import new_figure
 
 LOOKS = [
     Look("first", "#4B2E83", "D"),
