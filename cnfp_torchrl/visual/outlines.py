@@ -53,6 +53,8 @@ class Outlines:
         self._direction = region.anchor.new_zeros(dim, len(self._ray)).T
         self._direction[:, chosen] = torch.from_numpy(self._ray).to(region.anchor)
         self._region = region
+        count = len(region.sets)
+        self._holds = [True] * count if region.active is None else region.active.tolist()
         self._gauges: list[NDArray[np.float64] | None] = [
             each.gauge(self._direction, region.anchor).numpy() if self.holds(k) else None
             for k, each in enumerate(region.sets)
@@ -61,7 +63,7 @@ class Outlines:
 
     def holds(self, index: int) -> bool:
         """Tell whether a set is active; of a dropped one no inner point is known."""
-        return self._region.active is None or bool(self._region.active[index])
+        return self._holds[index]
 
     def of_set(self, index: int) -> Line | None:
         """Return the closed boundary of one set, ``(points, m)``; None for a dropped one."""
