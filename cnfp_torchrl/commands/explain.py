@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from cnfp_torchrl.modules import flow_head
-from cnfp_torchrl.tasks.task_view import find_task_view
+from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.run_folder import RunFolder

@@ -8,22 +8,46 @@ from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs.task_view import (
+    NOTHING,
+    Boxes,
+    Discs,
+    Map,
+    Marks,
+    Polyline,
+    Series,
+    Shape,
+    StateSetter,
+    TaskView,
+    find_task_view,
+)
 
 # Whoever has an environment in hand looks for these here.
 from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
 __all__ = [
+    "NOTHING",
     "ActionGuard",
+    "Boxes",
     "ConstraintAnchor",
     "ConstraintCost",
+    "Discs",
     "GeometryTransform",
     "Indicator",
+    "Map",
+    "Marks",
     "PackedStates",
+    "Polyline",
     "RewardPenalty",
     "SampledGeometry",
+    "Series",
+    "Shape",
+    "StateSetter",
+    "TaskView",
     "appended_transforms",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
     "constraints_to_sample",
+    "find_task_view",
 ]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.tasks.task_view import NOTHING, TaskView
+from cnfp_torchrl.envs import NOTHING, TaskView
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 Effect = Literal["permissive", "restrictive", "dropped", "broken"]

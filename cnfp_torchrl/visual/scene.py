@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cnfp_torchrl.tasks.task_view import Map
+from cnfp_torchrl.envs import Map
 from cnfp_torchrl.visual.explanation import Explanation, explain
 from cnfp_torchrl.visual.outlines import Line, Outlines, View, set_outline, within
 from cnfp_torchrl.visual.setting import Setting

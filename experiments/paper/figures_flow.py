@@ -25,7 +25,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.tasks.task_view import find_task_view
+from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder

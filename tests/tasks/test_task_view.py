@@ -20,7 +20,7 @@ from torchrl.envs import (
 )
 
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
-from cnfp_torchrl.tasks.task_view import Map, Series, TaskView, find_task_view
+from cnfp_torchrl.envs import Map, Series, TaskView, find_task_view
 
 
 class Swing(TaskView):

@@ -19,7 +19,7 @@ from cnfp_torchrl.tasks.point_nav.dynamics import (
 )
 from cnfp_torchrl.tasks.point_nav.layout import EPISODE_STEPS, Layout
 from cnfp_torchrl.tasks.point_nav.task_view import PointNavView
-from cnfp_torchrl.tasks.task_view import TaskView
+from cnfp_torchrl.envs import TaskView
 
 
 class PointNavEnv(EnvBase):

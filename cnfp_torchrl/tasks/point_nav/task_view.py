@@ -20,7 +20,7 @@ from cnfp_torchrl.tasks.point_nav.geometry import (
 )
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import ShortestPath, side_distances
-from cnfp_torchrl.tasks.task_view import Boxes, Discs, Map, Marks, Polyline, Series, TaskView
+from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Series, TaskView
 
 _CANDIDATES = 1024
 _MOST_RESETS = 64

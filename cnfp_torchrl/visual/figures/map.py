@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
-from cnfp_torchrl.tasks.task_view import Boxes, Discs, Map, Marks, Point, Polyline, TaskView
+from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, TaskView
 from cnfp_torchrl.visual.colors import GOAL, INK
 from cnfp_torchrl.visual.scene import Scene
 
@@ -100,7 +100,7 @@ def draw_moves(axes: Axes, scene: Scene, colors: Mapping[str, str]) -> None:
     axes.set_title("\n".join(["allowed moves on the map", *_values(scene)]))
 
 
-def draw_goal(axes: Axes, goal: Point, *, reached: bool = True) -> None:
+def draw_goal(axes: Axes, goal: tuple[float, float], *, reached: bool = True) -> None:
     """Draw a goal as a star, filled once it is reached."""
     axes.plot(*goal, zorder=4, **_goal(reached))
 

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cnfp_torchrl.tasks.task_view import NOTHING, TaskView
+from cnfp_torchrl.envs import NOTHING, TaskView
 from cnfp_torchrl.visual.colors import INK, MUTED
 from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.figures.map import AGENT, draw_moves, goal_entry, legend_entry

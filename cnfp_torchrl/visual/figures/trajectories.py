@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.tasks.task_view import TaskView, find_task_view
+from cnfp_torchrl.envs import TaskView, find_task_view
 from cnfp_torchrl.visual.colors import INK, constraint_colors
 from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.figures.map import (

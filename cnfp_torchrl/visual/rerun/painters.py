@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rerun.components import ImageFormat
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.tasks.task_view import Boxes, Discs, Map, Marks, Polyline, Shape
+from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Shape
 from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.rerun import entities, style

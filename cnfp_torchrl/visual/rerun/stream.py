@@ -50,7 +50,7 @@ class FlowStream:
     Args:
         recording: an open one; Rerun's own stream, or what holds it as ``stream``.
         actor: the policy, from `make_constrained_actor` or `constrain`.
-        env: shows its task (`cnfp_torchrl.tasks.task_view`) and says what the costs are called;
+        env: shows its task (`cnfp_torchrl.envs`) and says what the costs are called;
             None: neither is shown.
         projections: pairs of action components, counted from 0, a row of views for each, for
             actions of more than two components; None shows the first two.
