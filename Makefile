@@ -14,7 +14,7 @@ NUMERIC := $(filter-out %/test_compile.py,$(wildcard tests/bijectors/test_*.py t
 	tests/test_distributions.py tests/modules/test_latent.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench bench-updates paper figures check lint rooms types format clean
+.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench bench-updates paper figures docs check lint rooms types format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,11 +51,19 @@ bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 mi
 bench-updates: $(STAMP) ## Time updates and training beside Stable-Baselines3 (some 10 minutes)
 	$(PY) experiments/benchmarks/updates.py $(ARGS)
 
-paper: $(STAMP) ## Repeat the paper's experiment in outputs/paper (ARGS="--methods exact --seeds 0-4")
-	$(PY) -m experiments.paper $(ARGS)
+# A run that failed is told at the end, but takes no figure from the others.
+paper: $(STAMP) ## Repeat the paper's experiment in outputs/paper, resumable (ARGS="key=value ...")
+	$(PY) -m experiments.paper.run $(ARGS); status=$$?; \
+	$(PY) -m experiments.paper.report outputs/paper && exit $$status
 
-figures: $(STAMP) ## Redraw the figures and the report of the kept data in experiments/paper
+figures: $(STAMP) ## Redraw the figures and pages of the kept records in experiments/paper
 	$(PY) -m experiments.paper.report $(ARGS)
+
+# A reference that leads nowhere, a formula that cannot be set, a page in no table of contents and
+# anything loaded from another host are errors.
+docs: $(STAMP) ## Build the documentation's site in docs/_build/html
+	$(PY) -m sphinx --quiet --jobs auto --fail-on-warning --keep-going -c docs . docs/_build/html $(ARGS)
+	@echo docs/_build/html/index.html
 
 audit: $(STAMP) ## Look for flaws in the constraints' geometry (ARGS="key=value ...")
 	$(PY) experiments/audit.py $(ARGS)

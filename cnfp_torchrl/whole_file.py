@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 
 @contextmanager
@@ -19,7 +20,7 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
 
     Args:
         path: the file's final name.
-        exclusive: refuse to take the place of another file, whoever made it in the meantime.
+        exclusive: never replace another file, whoever made it in the meantime.
 
     Raises:
         FileExistsError: when exclusive and there is a file of this name.
@@ -37,3 +38,13 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
             partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write plain values as JSON, whole or not at all.
+
+    Raises:
+        ValueError: for infinity and NaN, which JSON has not.
+    """
+    with whole_file(path) as file:
+        file.write(f"{json.dumps(document, indent=2, allow_nan=False)}\n".encode())

@@ -1,4 +1,4 @@
-"""The commands as a user types them, each in a process of its own."""
+"""The commands, each in a process of its own."""
 
 import json
 import os
@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-BIN = Path(sys.executable).parent
+from tests.entry_points import ROOT, SCRIPTS
+
 TINY = [
     "collector.total_frames=96",
     "training.warmup_frames=48",
@@ -23,9 +24,9 @@ TINY = [
 
 def run(cwd: Path, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [BIN / command, *arguments],
+        [sys.executable, "-m", SCRIPTS[command].partition(":")[0], *arguments],
         cwd=cwd,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -85,7 +86,7 @@ def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
     ("command", "arguments", "message"),
     [
         ("cnfp-train", ["flow=perfect"], "exact"),
-        ("cnfp-train", ["flow.order=[battery,wind]"], "wind"),
+        ("cnfp-train", ["env.order=[battery,wind]"], "wind"),
         ("cnfp-train", ["nonsense=1"], "nonsense"),
         ("cnfp-train", ["experiment=lagrangain"], "lagrangian_threshold"),
         ("cnfp-train", ["collector.total_frames=-3"], "collector.total_frames: expected a whole"),

@@ -71,12 +71,9 @@ def test_checkout_finds_its_own_configuration() -> None:
     assert configuration.config_directory() == ROOT / "conf"
 
 
-def test_missing_configuration_names_the_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(configuration, "_PACKAGE", tmp_path / "cnfp_torchrl")
+def test_missing_configuration_names_the_places(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="configuration files") as error:
-        configuration.config_directory()
+        configuration.config_directory(tmp_path / "cnfp_torchrl")
     assert str(tmp_path / "cnfp_torchrl" / "conf") in str(error.value)
     assert str(tmp_path / "conf") in str(error.value)
 

@@ -5,7 +5,7 @@ the geometry allows? *Coverage*: which share of the actions that the indicators 
 geometry's sets?
 
 The indicators judge one step. A set may be smaller than what one step allows because it plans
-ahead: a battery must last to the next station. That lowers the coverage and is no flaw; it is what
+ahead: a braking car needs the whole way. That lowers the coverage and is no flaw; it is what
 keeps the policy from *dead ends*, states in which the constraint has to be dropped. Whether it
 succeeds is seen in two ways: by the allowed actions that lead to a dead end, and by violations in
 rollouts after a state in which the constraint held.
@@ -21,50 +21,34 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.audit.measures import executed, findings, worst_scene
-from cnfp_torchrl.audit.probes import CopiedProbe, PlacedProbe, Probe, Reader
+from cnfp_torchrl.audit.lookahead import (
+    CopyLookahead,
+    Lookahead,
+    StateSetterLookahead,
+    StepReader,
+)
+from cnfp_torchrl.audit.metrics import executed, measure, worst_state
 from cnfp_torchrl.audit.report import AuditReport
 from cnfp_torchrl.audit.rollouts import roll_out
-from cnfp_torchrl.audit.states import (
-    Place,
-    bare,
-    known_place,
-    state_keys,
-    uniform_states,
-)
-from cnfp_torchrl.audit.trial import run_trial
-from cnfp_torchrl.envs import Indicator, constraint_bijectors
-from cnfp_torchrl.modules import (
-    ConstrainedFlowModule,
-    ConstraintBijector,
-    Flow,
-    flow_head,
-)
-from cnfp_torchrl.training.settings import COUNT, FLAG, WHOLE
-
-_EXPECTED = {
-    "states": COUNT,
-    "actions": COUNT,
-    "steps": COUNT,
-    "uniform": FLAG,
-    "examples": WHOLE,
-    "strict": FLAG,
-    "seed": WHOLE,
-}
+from cnfp_torchrl.audit.samples import draw_samples
+from cnfp_torchrl.audit.states import bare, state_keys, uniform_states
+from cnfp_torchrl.configuration import require_fields
+from cnfp_torchrl.envs import Indicator, StateSetter, constraint_bijectors, find_task_view
+from cnfp_torchrl.modules import ConstrainedFlowModule, ConstraintBijector, Flow, flow_head
 
 
 @dataclass(frozen=True)
 class AuditSettings:
-    """How much is tried.
+    """The extent of an audit.
 
     Args:
-        states: from each source.
-        actions: through the flow, and as many uniform ones, in each state.
-        steps: of the rollouts that states are taken from; more where copies need them.
-        uniform: also look at states drawn uniformly, where the environment can be put into them.
-        examples: of each kind of finding that are kept.
-        strict: dead ends are flaws, too: for geometry that promises never to be dropped.
-        seed: of everything drawn.
+        states: number of states from each source.
+        actions: number of actions through the flow, and of uniform ones, in each state.
+        steps: length of the rollouts that states are taken from; more where copies need it.
+        uniform: also draw states uniformly, where the environment can be put into them.
+        examples: number of examples of each kind of flaw that are kept.
+        strict: count dead ends as flaws, for geometry that promises never to be dropped.
+        seed: seed of everything drawn.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -79,8 +63,7 @@ class AuditSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, expected in _EXPECTED.items():
-            expected.require(f"audit.{name}", getattr(self, name))
+        require_fields("audit", self)
 
 
 @torch.no_grad()
@@ -92,7 +75,7 @@ def audit(
     flow: Flow | str = "exact",
     actor: SafeProbabilisticTensorDictSequential | None = None,
     indicators: Mapping[str, Indicator] | None = None,
-    place: Place | None = None,
+    state_setter: StateSetter | None = None,
     settings: AuditSettings | None = None,
 ) -> AuditReport:
     """Audit the geometry that an environment publishes; see the module for what is asked.
@@ -103,66 +86,68 @@ def audit(
     - judges, by the constraints' names: a `cnfp_torchrl.envs.ConstraintCost` with indicators, or
       its own ``cost`` and ``constraint_names``, or `indicators`;
     - a way back into a state, to try many actions in it: ``copy.deepcopy`` keeps its state, as
-      with environments in PyTorch and Gymnasium's classic control, but not with MuJoCo; or `place`,
-      which is faster::
+      with environments in PyTorch and Gymnasium's classic control, but not with MuJoCo; or a state
+      setter, which is faster::
 
-        def place(env, states):  # env without its transforms, states of its batch size
+        def set_state(env, states):  # env without its transforms, states of its batch size
             env.my_state = states["observation"].clone()
             return TensorDict({"observation": env.my_observation()}, env.batch_size)
 
-    States come from rollouts and, with `place`, also uniformly from the observation spec (normally
-    distributed where that is unbounded).
+    States come from rollouts and, with a state setter, also from the observation spec: uniformly
+    distributed, and normally where that is unbounded.
 
     Args:
-        env: the environment; it is reset. With a larger batch the audit is faster.
-        bijectors: one for each constraint; None takes those of the geometry transforms.
-        order: see `cnfp_torchrl.modules.ConstrainedFlowModule`.
-        flow: see `cnfp_torchrl.modules.ConstrainedFlowModule`.
-        actor: a constrained one that acts in the rollouts, and whose flow is audited instead; None
-            takes safe random actions.
+        env: the environment, which is reset. With a larger batch the audit is faster.
+        bijectors: bijectors, one for each constraint; None takes those of the geometry transforms.
+        order: the constraints' names in order of application, see
+            `cnfp_torchrl.modules.ConstrainedFlowModule`.
+        flow: the flow, see `cnfp_torchrl.modules.ConstrainedFlowModule`.
+        actor: a constrained actor that acts in the rollouts, and whose flow is audited instead;
+            None takes safe random actions.
         indicators: named indicators that judge a step; None takes the environment's ``cost``.
-        place: puts the environment into given states, see `Place`; None knows point navigation,
-            and copies any other environment.
-        settings: how much is tried.
+        state_setter: function that puts the environment into given states; None takes that of the
+            environment's `cnfp_torchrl.envs.TaskView`, and copies environments without one.
+        settings: extent of the audit.
 
     Raises:
         ValueError: when the environment publishes no geometry, or no indicator judges any of it.
-        TypeError: when there is no `place` and the environment cannot be copied with its state.
+        TypeError: when the environment has no state setter and cannot be copied with its state.
     """
     settings = AuditSettings() if settings is None else settings
     head = _head(env, bijectors, order, flow) if actor is None else flow_head(actor)
-    reader = Reader(env, head, indicators)
+    reader = StepReader(env, head, indicators)
     if not set(reader.names) & set(head.order):
         raise ValueError(
             f"indicators: expected one for at least one of the constraints {head.order}, given "
             f"{list(reader.names)}; give geometry and indicator the same name"
         )
-    place = known_place(env) if place is None else place
+    if state_setter is None:
+        state_setter = find_task_view(env).state_setter
     keys = state_keys(env)
-    copies = 0 if place else -(-settings.states // env.batch_size.numel())
+    copies = 0 if state_setter else -(-settings.states // env.batch_size.numel())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         env.set_seed(settings.seed)
         policy = head.random if actor is None else actor
         # Each copy is of another time.
         steps = max(settings.steps, copies)
-        record = roll_out(env, policy, reader, steps=steps, copies=copies)
-        probes: dict[str, Probe] = {}
-        if place is None:
-            probes["rollouts"] = CopiedProbe(record.copies, reader)
+        rollouts = roll_out(env, policy, reader, steps=steps, copies=copies)
+        lookaheads: dict[str, Lookahead] = {}
+        if state_setter is None:
+            lookaheads["rollouts"] = CopyLookahead(rollouts.copies, reader)
         else:
-            seen = record.states.reshape(-1)
+            seen = rollouts.states.reshape(-1)
             chosen = seen[torch.randperm(len(seen))[: settings.states]]
-            probes["rollouts"] = PlacedProbe(env, place, chosen, reader)
+            lookaheads["rollouts"] = StateSetterLookahead(env, state_setter, chosen, reader)
             if settings.uniform:
-                anywhere = uniform_states(env, place, settings.states)
-                probes["uniform"] = PlacedProbe(env, place, anywhere, reader)
-        trials = {
-            source: run_trial(probe, head, keys, reader.names, settings.actions)
-            for source, probe in probes.items()
+                drawn = uniform_states(env, state_setter, settings.states)
+                lookaheads["uniform"] = StateSetterLookahead(env, state_setter, drawn, reader)
+        samples = {
+            source: draw_samples(lookahead, head, keys, reader.names, settings.actions)
+            for source, lookahead in lookaheads.items()
         }
-    scenes = [
-        max((worst_scene(trial, name, source) for source, trial in trials.items()), key=_first)[1]
+    worst = [
+        max((worst_state(drawn, name, source) for source, drawn in samples.items()), key=_first)[1]
         for name in head.order
     ]
     return AuditReport(
@@ -170,15 +155,15 @@ def audit(
             "environment": type(bare(env)).__name__,
             "flow": type(head.flow).__name__,
             "policy": "safe random" if actor is None else "actor",
-            "judged by": "copies" if place is None else "placing",
+            "judged by": "copies" if state_setter is None else "state setter",
             "settings": asdict(settings),
         },
-        sources={name: findings(trial, settings.examples) for name, trial in trials.items()},
-        executed=executed(record, reader, head, keys, settings.examples),
+        sources={source: measure(drawn, settings.examples) for source, drawn in samples.items()},
+        executed=executed(rollouts, reader, head, keys, settings.examples),
         order=tuple(head.order),
-        notes=tuple(_notes(head.order, reader.names, place)),
+        notes=tuple(_notes(head.order, reader.names, state_setter)),
         strict=settings.strict,
-        scenes=tuple(scenes),
+        worst_states=tuple(worst),
     )
 
 
@@ -203,7 +188,9 @@ def _head(
     )
 
 
-def _notes(order: Sequence[str], indicators: Sequence[str], place: Place | None) -> list[str]:
+def _notes(
+    order: Sequence[str], indicators: Sequence[str], state_setter: StateSetter | None
+) -> list[str]:
     notes = [
         f"{name}: no indicator of this name, so that its soundness and coverage are not judged"
         for name in order
@@ -214,9 +201,9 @@ def _notes(order: Sequence[str], indicators: Sequence[str], place: Place | None)
         for name in indicators
         if name not in order
     ]
-    if place is None:
+    if state_setter is None:
         notes.append(
             "states from rollouts only: the environment cannot be put into a chosen state; pass "
-            "place to look at uniform states, too"
+            "a state_setter to look at uniform states, too"
         )
     return notes

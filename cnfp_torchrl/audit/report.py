@@ -1,125 +1,40 @@
-"""What an audit found: numbers with their uncertainty, examples, and a verdict."""
+"""The report of an audit: numbers with their uncertainty, examples, tables and a verdict."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from cnfp_torchrl.audit.table import as_text
+from cnfp_torchrl.audit.statistics import Quantiles, Share
 from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.text_table import text_table
 
 TOGETHER = "together"
 """The name under which the intersection of all constraints is reported."""
 
-_Z = 1.959964  # two-sided 95 %
-_QUANTILES = {"min": 0.0, "q05": 0.05, "q25": 0.25, "median": 0.5, "q75": 0.75, "q95": 0.95}
-_QUANTILES |= {"max": 1.0}
-
-Quantiles = dict[str, float | None]
-"""``min``, ``q05``, ``q25``, ``median``, ``q75``, ``q95``, ``max``."""
-
 
 @dataclass(frozen=True)
-class Share:
-    """A share of samples with a 95 % interval.
+class ConstraintMetrics:
+    """Measurements of one constraint, or of all of them together, in one set of states.
 
     Args:
-        count: how many.
-        of: out of how many.
-        share: ``count / of``; None without samples.
-        low: lower end of the interval.
-        high: upper end of the interval.
-    """
-
-    count: int
-    of: int
-    share: float | None
-    low: float
-    high: float
-
-    @classmethod
-    def clustered(cls, hits: Tensor, totals: Tensor) -> Share:
-        """Return a share of samples that come in clusters, the actions tried in one state.
-
-        Wilson's interval, with the sample size that independent samples of the same variance would
-        have: actions in one state are alike, so that their number says too much. Where all states
-        agree on 0 or 1, the number of states counts.
-
-        Args:
-            hits: in each cluster, ``(n,)``.
-            totals: of each cluster, ``(n,)``; clusters without samples count for nothing.
-        """
-        hits, totals = hits[totals > 0].double(), totals[totals > 0].double()
-        clusters, of = len(totals), int(totals.sum())
-        if of == 0:
-            return cls(0, 0, None, 0.0, 1.0)
-        count = int(hits.sum())
-        share = count / of
-        if clusters == 1 or count in (0, of):
-            return cls(count, of, share, *wilson(share, clusters))
-        spread = float((hits - share * totals).square().sum()) * clusters / (clusters - 1)
-        size = share * (1 - share) * of**2 / spread if spread > 0 else of
-        return cls(count, of, share, *wilson(share, min(size, of)))
-
-
-def wilson(share: float, size: float) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share that was seen in a sample of some size."""
-    weight = _Z**2 / size
-    middle = (share + weight / 2) / (1 + weight)
-    half = math.sqrt(weight * share * (1 - share) + weight**2 / 4) / (1 + weight)
-    # Exactly at the ends, where rounding would leave out the share itself.
-    low = 0.0 if share == 0 else max(middle - half, 0.0)
-    return low, 1.0 if share == 1 else min(middle + half, 1.0)
-
-
-def quantiles(values: Tensor) -> Quantiles:
-    """Return quantiles of values ``(n,)``; None where there are none or they are infinite."""
-    if len(values) == 0:
-        return dict.fromkeys(_QUANTILES)
-    at = torch.tensor(list(_QUANTILES.values()), dtype=torch.float64, device=values.device)
-    # Interpolation between infinities would be NaN.
-    found = torch.quantile(values.double(), at, interpolation="nearest").tolist()
-    return {
-        name: value if math.isfinite(value) else None
-        for name, value in zip(_QUANTILES, found, strict=True)
-    }
-
-
-def plain(value: Tensor) -> Any:
-    """Return a tensor as nested lists that JSON can hold; infinity and NaN become strings."""
-    return _finite(value.tolist())
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_finite(each) for each in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-@dataclass(frozen=True)
-class Findings:
-    """What was found about one constraint, or about all of them together, in one set of states.
-
-    Args:
-        name: of the constraint, or `TOGETHER`.
-        unsound: of the actions inside its set, those that its indicator calls a violation; None
+        name: the constraint's name, or `TOGETHER`.
+        unsound: share of the actions inside its set that its indicator calls a violation; None
             without an indicator.
-        escaped: of the flow's samples, those outside the set though it is active.
-        dead_ends: of the flow's samples that break nothing in states where everything is active,
-            those that led to a state in which it has to be dropped.
-        coverage: of the actions that its indicator allows, those inside its set; together, those
+        escaped: share of the flow's samples that lie outside the set though it is active.
+        dead_ends: share, of the flow's samples that break nothing in states where everything is
+            active, of those that led to a state in which it has to be dropped.
+        coverage: share of the actions that its indicator allows inside its set; together, of those
             that the flow can reach. Where it is active.
-        binding: the same, over those of the states in which the set leaves out any tried action.
-        dropped: of the states, those in which it is not active; together, any of them.
-        possible: of those, the ones in which some tried action keeps the indicator for a step.
-        volume: the share of the action bounds that it leaves, over the states where it is active.
-        slack: at the anchor, in action units, over the same states.
-        examples: states by kind of finding (``unsound``, ``escaped``, ``dead_ends``, ``dropped``),
+        binding: coverage in the states where the set leaves out any tried action.
+        dropped: share of the states in which it is not active; together, in which any is not.
+        possible: share of those in which some tried action keeps the indicator for a step.
+        volume: quantiles of its share of the action bounds, over the states where it is active.
+        slack: quantiles of the anchor's slack, in action units, over the same states.
+        examples: states by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``dropped``),
             the worst ones first.
     """
 
@@ -138,14 +53,14 @@ class Findings:
 
 @dataclass(frozen=True)
 class Executed:
-    """What happened while the policy acted.
+    """Counts of what happened while the policy acted.
 
     Args:
-        steps: how many were taken.
-        violations: of each indicator, over all steps.
-        led_into: of those, the violations in episodes in which the constraint had been active
-            before: allowed actions led from a state where it held to its violation.
-        examples: for each constraint, the last state in which it was active, with the action.
+        steps: number of steps.
+        violations: number of violations by indicator, over all steps.
+        led_into: number of those in episodes in which the constraint had been active before:
+            allowed actions led from a state where it held to its violation.
+        examples: last states in which each constraint was active, with the action.
     """
 
     steps: int
@@ -155,24 +70,24 @@ class Executed:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One state with every action that was tried in it, for pictures.
+class WorstState:
+    """The state that speaks most against a constraint's set, with every action tried in it.
 
     Args:
-        name: of the constraint that it tells most about.
-        source: where the state comes from.
-        why: what makes the state the worst one.
-        state: its entries.
+        name: the constraint's name.
+        source: the state's source, such as ``rollouts``.
+        reason: words for what makes the state the worst one.
+        state: the state's entries.
         region: sets, anchor and flags, of batch shape ``()``.
-        actions: ``(m, d)``.
-        inside: whether each lies in the constraint's set, ``(m,)``.
-        violates: whether the indicator calls it a violation, ``(m,)``.
-        dead_end: whether the constraint had to be dropped after it, ``(m,)``.
+        actions: the actions tried, ``(m, d)``.
+        inside: mask of the actions in the constraint's set, ``(m,)``.
+        violates: mask of the actions that the indicator calls violations, ``(m,)``.
+        dead_end: mask of the actions after which the constraint had to be dropped, ``(m,)``.
     """
 
     name: str
     source: str
-    why: str
+    reason: str
     state: dict[str, Any]
     region: Region
     actions: Tensor
@@ -186,26 +101,26 @@ class AuditReport:
     """Everything that an audit found; as a string, tables and the verdict.
 
     Args:
-        subject: what was audited: flow, order, policy, how actions were judged, settings.
-        sources: findings by where the states came from, then constraint; the last one is
+        subject: names of environment, flow and policy, and the settings.
+        sources: measurements by where the states came from, then constraint; the last one is
             `TOGETHER`.
-        executed: what happened in the rollouts.
+        executed: counts of the rollouts.
         order: the constraints in order of application.
-        notes: what the numbers leave out.
-        strict: whether dead ends are flaws.
-        scenes: one for each constraint; not part of `as_dict`.
+        notes: remarks on what the numbers leave out.
+        strict: flag that makes dead ends flaws.
+        worst_states: worst states, one for each constraint, for pictures; not part of `as_dict`.
     """
 
     subject: dict[str, Any]
-    sources: dict[str, list[Findings]]
+    sources: dict[str, list[ConstraintMetrics]]
     executed: Executed
     order: tuple[str, ...]
     notes: tuple[str, ...] = ()
     strict: bool = False
-    scenes: tuple[Scene, ...] = field(default=(), repr=False)
+    worst_states: tuple[WorstState, ...] = field(default=(), repr=False)
 
     def __str__(self) -> str:
-        return as_text(self)
+        return "\n\n".join(_paragraphs(self))
 
     @property
     def flaws(self) -> list[str]:
@@ -216,9 +131,9 @@ class AuditReport:
         return list(self._flaws())
 
     def _flaws(self) -> Iterator[str]:
-        for source, findings in self.sources.items():
-            *single, together = (self._flaws_of(each, source) for each in findings)
-            # All together fail where one does: told once.
+        for source, measured in self.sources.items():
+            *single, together = (self._flaws_of(metrics, source) for metrics in measured)
+            # All together fail where one does: reported once.
             yield from [flaw for flaws in single for flaw in flaws] or together
         yield from self._never_active()
         for name, count in self.executed.led_into.items():
@@ -230,18 +145,18 @@ class AuditReport:
 
     def _never_active(self) -> Iterator[str]:
         for name in self.order:
-            found = [each for many in self.sources.values() for each in many if each.name == name]
-            states = sum(each.dropped.of for each in found)
-            if states > sum(each.dropped.count for each in found):
+            found = [x for measured in self.sources.values() for x in measured if x.name == name]
+            states = sum(metrics.dropped.of for metrics in found)
+            if states > sum(metrics.dropped.count for metrics in found):
                 continue
-            possible = sum(each.possible.count for each in found if each.possible is not None)
+            possible = sum(x.possible.count for x in found if x.possible is not None)
             if possible:
                 yield (
                     f"{name}: dropped in all of {states} states, in {possible} of which its "
                     "indicator allows an action"
                 )
 
-    def _flaws_of(self, found: Findings, source: str) -> list[str]:
+    def _flaws_of(self, found: ConstraintMetrics, source: str) -> list[str]:
         kinds = [(found.unsound, "actions inside the set violate the indicator")]
         kinds += [(found.escaped, "samples of the flow lie outside the active set")]
         if self.strict:
@@ -260,8 +175,119 @@ class AuditReport:
             "order": list(self.order),
             "notes": list(self.notes),
             "sources": {
-                source: {each.name: asdict(each) for each in findings}
-                for source, findings in self.sources.items()
+                source: {metrics.name: asdict(metrics) for metrics in measured}
+                for source, measured in self.sources.items()
             },
             "executed": asdict(self.executed),
         }
+
+
+_Columns = dict[str, Callable[[ConstraintMetrics], str]]
+
+_SOUNDNESS: _Columns = {
+    "unsound": lambda x: _count(x.unsound),
+    "escaped": lambda x: _count(x.escaped),
+    "dead ends": lambda x: _count(x.dead_ends),
+    "dropped": lambda x: _percent(x.dropped),
+    "though possible": lambda x: _percent(x.possible),
+}
+_COVERAGE: _Columns = {
+    "coverage": lambda x: _percent(x.coverage, interval=True),
+    "binding": lambda x: _percent(x.binding),
+    "volume (5-95 %)": lambda x: _percentiles(x.volume),
+    "anchor slack (least)": lambda x: f"{_number(x.slack['median'])} ({_number(x.slack['min'])})",
+}
+"""Columns of the two tables, each of which fits a terminal of 100 columns."""
+
+_LEGEND = """\
+unsound: actions inside the active set that the environment's indicator calls violations
+escaped: samples of the flow outside the active set
+dead ends: allowed actions after which the constraint must be dropped
+dropped: states in which the constraint is not active, because it cannot hold or yields to others
+though possible: states of those in which some action keeps its indicator for one step
+coverage: share of the actions allowed by the indicators, one step ahead, that the set lets the flow
+  reach, with a 95 % interval over states; below 100 % is no flaw where a set plans further ahead
+binding: the coverage in states where the set leaves some action out
+volume: share of the action bounds inside the set, median over states
+anchor slack: of the anchor, in action units, median over states"""
+
+
+def _paragraphs(report: AuditReport) -> Iterator[str]:
+    subject = report.subject
+    yield (
+        f"{subject['environment']}, {subject['flow']}, order {' < '.join(report.order)}; states of "
+        f"{' and '.join(report.sources)}, policy: {subject['policy']}"
+    )
+    for columns in (_SOUNDNESS, _COVERAGE):
+        rows = [["states", "constraint", *columns]]
+        for source, measured in report.sources.items():
+            rows += [
+                [source, metrics.name, *(cell(metrics) for cell in columns.values())]
+                for metrics in measured
+            ]
+        yield text_table(rows)
+    yield _LEGEND
+    executed = report.executed
+    rows = [["executed", "violations", "after the constraint had held"]]
+    for name, count in executed.violations.items():
+        rows.append([name, str(count), str(executed.led_into.get(name, "no geometry"))])
+    yield f"{text_table(rows)}\nin {executed.steps} steps of the policy"
+    if report.notes:
+        yield "\n".join(f"note: {note}" for note in report.notes)
+    yield from _examples(report)
+    flaws = report.flaws
+    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else "no flaw found"
+
+
+def _examples(report: AuditReport) -> Iterator[str]:
+    """Yield the worst example of each kind of flaw, with the state it fails in."""
+    for source, measured in report.sources.items():
+        for kind in ("unsound", "escaped", "dead_ends"):
+            *single, together = measured
+            # Those of all together are shown where they are no constraint's own.
+            for metrics in [x for x in single if x.examples[kind]] or [together]:
+                for example in metrics.examples[kind][:1]:
+                    name = kind.replace("_", " ")
+                    yield _example(f"{metrics.name}, {source}, worst of {name}", example)
+    for name, examples in report.executed.examples.items():
+        for example in examples[:1]:
+            yield _example(f"{name}, rollouts, the last state in which it held", example)
+
+
+def _example(title: str, example: dict[str, Any]) -> str:
+    lines = [f"{key}: {_short(value)}" for key, value in example.items() if key != "sets"]
+    lines += [f"set of {name}: {_short(fields)}" for name, fields in example["sets"].items()]
+    return f"{title}\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def _short(value: Any) -> str:
+    """Return a plain value with numbers to six digits; the JSON file has all of them."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_short(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return f"[{', '.join(map(_short, value))}]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _count(share: Share | None) -> str:
+    return "not judged" if share is None else f"{share.count} of {share.of}"
+
+
+def _percent(share: Share | None, *, interval: bool = False) -> str:
+    if share is None:
+        return "not judged"
+    if share.share is None:
+        return "-"
+    percent = f"{100 * share.share:.1f} %"
+    return f"{percent} [{100 * share.low:.1f}, {100 * share.high:.1f}]" if interval else percent
+
+
+def _percentiles(found: Quantiles) -> str:
+    if found["median"] is None:
+        return "-"
+    middle, low, high = (100 * (found[name] or 0.0) for name in ("median", "q05", "q95"))
+    return f"{middle:.0f} % ({low:.0f}-{high:.0f} %)"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -11,13 +12,15 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cnfp_torchrl.audit.probes import Reader
+from cnfp_torchrl.audit.lookahead import StepReader
 from cnfp_torchrl.audit.states import bare, difference
-from cnfp_torchrl.training.evaluation import Policy
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+"""Any TorchRL policy."""
 
 
-class Record(NamedTuple):
-    """Rollouts, ``(steps, agents)``."""
+class Rollouts(NamedTuple):
+    """Steps of a policy, ``(steps, agents)``."""
 
     states: TensorDictBase
     """With the action taken; without what it led to."""
@@ -30,16 +33,16 @@ class Record(NamedTuple):
 
 
 def roll_out(
-    env: EnvBase, policy: Policy, reader: Reader, *, steps: int, copies: int = 0
-) -> Record:
+    env: EnvBase, policy: Policy, reader: StepReader, *, steps: int, copies: int = 0
+) -> Rollouts:
     """Let a policy act, and keep every state.
 
     Args:
-        env: is reset first.
-        policy: writes the action.
-        reader: of steps.
-        steps: how many, over episodes.
-        copies: how often the whole environment is copied, at times drawn at random.
+        env: the environment, which is reset first.
+        policy: the policy.
+        reader: what reads indicators and flags.
+        steps: number of steps, over episodes.
+        copies: number of copies of the whole environment, at times drawn at random.
 
     Raises:
         TypeError: when copies are asked for and the environment cannot be copied with its state.
@@ -64,14 +67,14 @@ def roll_out(
             kept.append((transition.exclude("next").reshape(-1), violated, ended))
             state = following
     states, violated, ended = (torch.stack(list(x)) for x in zip(*kept, strict=True))
-    return Record(states, violated, ended, copied)
+    return Rollouts(states, violated, ended, copied)
 
 
 def _copy(env: EnvBase) -> EnvBase:
     try:
         return copy.deepcopy(env)
     except Exception as error:
-        raise TypeError(f"{_expected(env)}, but copying fails: {error}; {_PLACE}") from error
+        raise TypeError(f"{_expected(env)}, but copying fails: {error}; {_REMEDY}") from error
 
 
 def _refuse_unfaithful(
@@ -82,7 +85,7 @@ def _refuse_unfaithful(
         torch.set_rng_state(noise)
         told = copy.deepcopy(twin).step(before.clone())
     if (key := difference(env, transition.get("next"), told.get("next"))) is not None:
-        raise TypeError(f"{_expected(env)}, but its copy steps to another {key!r}; {_PLACE}")
+        raise TypeError(f"{_expected(env)}, but its copy steps to another {key!r}; {_REMEDY}")
 
 
 def _expected(env: EnvBase) -> str:
@@ -90,7 +93,7 @@ def _expected(env: EnvBase) -> str:
     return f"env: expected one that can be copied, to try many actions in one state, given {name}"
 
 
-_PLACE = (
-    "give place (in a configuration env.place), a function that puts the environment into given "
-    "states, see docs/own_environment.md"
+_REMEDY = (
+    "give a state_setter (in a configuration env.state_setter), a function that puts the "
+    "environment into given states, see docs/own_environment.md"
 )

@@ -6,18 +6,21 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-import torch
-from tensordict import TensorDictBase
+from cnfp_torchrl.commands.extras import needs_extra
 
-from cnfp_torchrl.modules import flow_head
-from cnfp_torchrl.envs import find_task_view
-from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.environment import counted_constraints
-from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import EvaluationSettings
-from cnfp_torchrl.training.watching import replay_episodes
-from cnfp_torchrl.visual.explanation import explain
-from cnfp_torchrl.visual.replay import replay_step
+with needs_extra("train"):
+    import torch
+    from tensordict import TensorDictBase
+
+    from cnfp_torchrl.envs import find_task_view
+    from cnfp_torchrl.modules import flow_head
+    from cnfp_torchrl.training.agent import build_environment, load_actor
+    from cnfp_torchrl.training.callbacks import replay_episodes
+    from cnfp_torchrl.training.environment import counted_constraints
+    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.settings import EvaluationSettings
+    from cnfp_torchrl.visual.explanation import explain
+    from cnfp_torchrl.visual.replay import replay_step
 
 _SAMPLES = 1000
 

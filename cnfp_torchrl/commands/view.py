@@ -8,15 +8,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cnfp_torchrl.visual.rerun.follow import Follower, Lost, NotStarted, is_being_written
-from cnfp_torchrl.visual.rerun.viewers import (
-    RunningViewer,
-    SinkError,
-    Viewer,
-    ViewerWindow,
-    WebViewer,
-    has_display,
-)
+from cnfp_torchrl.commands.extras import needs_extra
+
+with needs_extra("rerun"):
+    from cnfp_torchrl.visual.rerun.follow import Follower, Lost, NotStarted, is_being_written
+    from cnfp_torchrl.visual.rerun.viewers import (
+        RunningViewer,
+        SinkError,
+        Viewer,
+        ViewerWindow,
+        WebViewer,
+        has_display,
+    )
 
 _FOLDERS = ("outputs", "multirun")
 

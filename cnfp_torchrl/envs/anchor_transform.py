@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import dropwhile
 from typing import Self
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.geometry import Box, GeometryError, lexicographic_anchor
+from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, lexicographic_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
     ActionBounds,
     ConstraintBijector,
     ConstraintPublisher,
     action_bounds,
+    appended_transforms,
     in_order,
 )
+
+UNSEEN_STEPS = (FrameSkipTransform, MultiAction, NoopResetEnv)
+"""TorchRL's transforms that take several steps of an environment for one of their own."""
 
 
 class ConstraintAnchor(Transform, ConstraintPublisher):
@@ -27,16 +32,23 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
     Reads the sets that the geometry transforms before it publish, and a candidate at
     ``("constraints", "safe_action")`` if there is one: a known safe action makes the anchor cheap.
     It is checked; where it fails, the general method decides
-    (`cnfp_torchrl.geometry.anchors.lexicographic_anchor`).
+    (`cnfp_torchrl.geometry.lexicographic_anchor`).
 
-    Writes ``("constraints", "anchor")``, ``(*batch, d)``, and ``("constraints", NAME, "active")``,
-    boolean ``(*batch,)``, False where the constraint cannot hold together with those of higher
-    priority.
+    Writes ``("constraints", "anchor")``, ``(*batch, d)``, and of each constraint
+
+    - ``("constraints", NAME, "active")``, boolean ``(*batch,)``: False where it cannot hold
+      together with those of higher priority,
+    - ``("constraints", NAME, "relaxation")``, ``(*batch,)``: by how much it is widened there, in
+      units of its slack; 0 where it is active, infinite where it had to be dropped,
+    - ``("constraints", NAME, "row_relaxation")``, ``(*batch, m)``: the same row by row, if its
+      family has rows.
 
     Args:
-        bijectors: one for each constraint; they know where the geometry lies.
-        order: the constraints' names in order of application, the last with the highest priority;
+        bijectors: One for each constraint; they know where the geometry lies.
+        order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order. The same as the flow's.
+        leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
+            smallest width of the action bounds.
 
     Raises:
         TypeError: when a bijector is none, or the order is a string.
@@ -46,9 +58,13 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
     states_order = True
 
     def __init__(
-        self, bijectors: Sequence[ConstraintBijector], order: Sequence[str] | None = None
+        self,
+        bijectors: Sequence[ConstraintBijector],
+        order: Sequence[str] | None = None,
+        leeway: float = LEEWAY,
     ) -> None:
         super().__init__()
+        self._leeway = leeway
         self._bijectors = in_order(bijectors, order)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
@@ -71,16 +87,22 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        anchor, active = lexicographic_anchor([bounds, *sets], candidate)
-        batch = next_tensordict.batch_size
-        next_tensordict.set(ANCHOR_KEY, anchor.expand(*batch, anchor.shape[-1]))
+        found = lexicographic_anchor([bounds, *sets], candidate, self._leeway)
+        batch, largest = next_tensordict.batch_size, found.largest()
+        next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
         for stage, bijector in enumerate(self._bijectors, start=1):
-            next_tensordict.set(bijector.active_key, active[..., stage].expand(batch))
+            next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))
+            next_tensordict.set(bijector.relaxation_key, largest[..., stage].expand(batch))
+            if bijector.row_relaxation_key is not None:
+                rows = found.relaxation[stage]
+                rows = rows.expand(*batch, rows.shape[-1])
+                next_tensordict.set(bijector.row_relaxation_key, rows)
         return next_tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._refuse_unseen_steps()
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -94,6 +116,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         """Add the anchor and the flags."""
         assert isinstance(observation_spec, Composite)
         bounds, batch = self._action_bounds(), observation_spec.shape
+        state = observation_spec.zero()
         observation_spec[ANCHOR_KEY] = Unbounded(
             (*batch, bounds.dim), dtype=bounds.dtype, device=observation_spec.device
         )
@@ -101,7 +124,28 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             observation_spec[bijector.active_key] = Binary(
                 shape=batch, dtype=torch.bool, device=observation_spec.device
             )
+            observation_spec[bijector.relaxation_key] = Unbounded(
+                batch, dtype=bounds.dtype, device=observation_spec.device
+            )
+            if bijector.row_relaxation_key is not None:
+                slacks = bijector.get_set(state).row_slacks(bounds.low)
+                observation_spec[bijector.row_relaxation_key] = Unbounded(
+                    (*batch, slacks.shape[-1]), dtype=bounds.dtype, device=observation_spec.device
+                )
         return observation_spec
+
+    def _refuse_unseen_steps(self) -> None:
+        """Refuse transforms behind this one that act in states for which it published nothing."""
+        behind = dropwhile(lambda each: each is not self, appended_transforms(self.container))
+        for each in behind:
+            if isinstance(each, UNSEEN_STEPS):
+                raise ValueError(
+                    f"{type(each).__name__}: expected inside the environment that is constrained, "
+                    "given one around it, which executes actions in states for which nobody asked "
+                    "what they allow; write constrain_env(TransformedEnv(env, "
+                    f"{type(each).__name__}(...)), ...), whose geometry must hold for all steps of "
+                    "one action"
+                )
 
     def clone(self) -> Self:
         """Return a copy without environment, which keeps the action bounds of this one's."""

@@ -25,8 +25,9 @@ class ConstraintCost(Transform):
     a reset. ``cost`` under ``next`` is the cost of the action beside it.
 
     Args:
-        indicators: named indicators, for environments without costs; they see the tensordicts
-            before and after the step. None: the environment publishes ``cost`` itself.
+        indicators: Functions by the constraint's name, for environments without costs; they see
+            the tensordicts before and after the step. None: the environment publishes ``cost``
+            itself.
 
     Raises:
         TypeError: for indicators that are no mapping of names to functions.
@@ -42,7 +43,7 @@ class ConstraintCost(Transform):
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """The columns' names: of the indicators, or of the environment that publishes costs."""
+        """The columns' names, of the indicators, or of the environment that publishes costs."""
         if self.indicators is not None:
             return tuple(self.indicators)
         if self.parent is None:

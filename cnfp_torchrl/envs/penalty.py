@@ -23,16 +23,16 @@ class RewardPenalty(Transform):
     transform, and evaluate without it.
 
     Args:
-        penalty: p > 0.
+        penalty: The penalty p; 0 is none and leaves the reward as it is.
 
     Raises:
-        ValueError: for a penalty that is not a positive number, and for an environment without
+        ValueError: for a penalty that is negative or not finite, and for an environment without
             ``cost``.
     """
 
     def __init__(self, penalty: float = 100.0) -> None:
-        if not 0 < penalty < math.inf:
-            raise ValueError(f"penalty: expected a number > 0, given {penalty}")
+        if not 0 <= penalty < math.inf:
+            raise ValueError(f"penalty: expected a number >= 0, given {penalty}")
         super().__init__(in_keys=[REWARD_KEY, COST_KEY], out_keys=[REWARD_KEY, RAW_REWARD_KEY])
         self.penalty = float(penalty)
 
@@ -58,6 +58,8 @@ class RewardPenalty(Transform):
         raw = next_tensordict.get(REWARD_KEY)
         violated = (next_tensordict.get(COST_KEY) > 0).any(-1, keepdim=True)
         next_tensordict.set(RAW_REWARD_KEY, raw)
+        if self.penalty == 0:
+            return next_tensordict
         punished = torch.full_like(raw, -self.penalty)
         return next_tensordict.set(REWARD_KEY, torch.where(violated, punished, raw))
 

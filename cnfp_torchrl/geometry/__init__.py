@@ -1,6 +1,15 @@
 """Sets of allowed actions and their intersections: containment, slack, gauges, anchors."""
 
-from cnfp_torchrl.geometry.anchors import MINIMUM_SLACK, chebyshev_center, lexicographic_anchor
+from cnfp_torchrl.geometry.anchor import (
+    DEPTH,
+    LEEWAY,
+    Anchored,
+    attempt_anchor,
+    chebyshev_center,
+    lexicographic_anchor,
+    relaxation_floor,
+    row_depths,
+)
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
 from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
 from cnfp_torchrl.geometry.constraint_set import (
@@ -21,8 +30,10 @@ from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
 from cnfp_torchrl.geometry.weighted_sums import PositivePart, WeightedL1Ball
 
 __all__ = [
+    "DEPTH",
     "EROSION_IN_EPS",
-    "MINIMUM_SLACK",
+    "LEEWAY",
+    "Anchored",
     "Ball",
     "Bounds",
     "Box",
@@ -41,6 +52,7 @@ __all__ = [
     "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
+    "attempt_anchor",
     "broadcast_shape",
     "chebyshev_center",
     "gauge_of_sides",
@@ -50,7 +62,9 @@ __all__ = [
     "power_of_two",
     "project",
     "project_onto_intersection",
+    "relaxation_floor",
     "require_action_bounds",
+    "row_depths",
     "scaled_direction",
     "sides",
 ]

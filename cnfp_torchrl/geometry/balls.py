@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import solve_triangular, vector_norm
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    largest_value,
+)
 from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone
 
@@ -25,7 +31,7 @@ class Ball(ConstraintSet):
 
     Args:
         center: ``(*batch, d)``.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -34,7 +40,7 @@ class Ball(ConstraintSet):
     event_dims: ClassVar[Mapping[str, int]] = {"center": 1, "radius": 0}
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
         yield "center", self.center.isinf(), "a finite center"
 
     def whiten(self, vector: Tensor) -> Tensor:
@@ -57,6 +63,13 @@ class Ball(ConstraintSet):
     def bounding_box(self) -> Bounds:
         radius = self.radius.unsqueeze(-1)
         return Bounds(self.center - radius, self.center + radius)
+
+    def inflated(self, by: Tensor) -> Self:
+        return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * (self.radius + length(self.center))).unsqueeze(-1)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
@@ -114,11 +127,8 @@ class Ellipsoid(ConstraintSet):
         diagonal = torch.eye(self.dim, dtype=torch.bool, device=self.scale_tril.device)
         yield "scale_tril", (self.scale_tril <= 0) & diagonal, "a positive diagonal"
         thin = ~(spectral_norm_bound(self._inverse()) < MOST_SKEWED)
-        yield (
-            "scale_tril",
-            thin,
-            f"an inverse below {MOST_SKEWED:g} over the smallest of its diagonal",
-        )
+        expected = f"an inverse below {MOST_SKEWED:g} in units of the smallest diagonal element"
+        yield "scale_tril", thin, expected
 
     def shape_problem(self) -> str | None:
         rows, columns = self.scale_tril.shape[-2:]
@@ -129,9 +139,6 @@ class Ellipsoid(ConstraintSet):
     def whiten(self, vector: Tensor) -> Tensor:
         """Return ``T^-1 vector``, the vector in coordinates where the ellipsoid is a unit ball."""
         return _solve(self.scale_tril, vector)
-
-    def contains(self, action: Tensor) -> Tensor:
-        return self.to(torch.float64).slack(action.double()) >= 0
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(1 - |T^-1 (a - m)|) / n``, n a bound of the norm of ``T^-1``."""
@@ -147,19 +154,33 @@ class Ellipsoid(ConstraintSet):
     def gauge_about(self, anchor: Tensor) -> Gauge:
         unit, scale_tril = self._in_units()
         of_ball = ball_gauge_about(_solve(scale_tril, anchor - self.center), unit)
-        return lambda direction: of_ball(_solve(scale_tril, direction))
+        # No closure: a flow's gauges are pickled with it.
+        return partial(_whitened_gauge, scale_tril, of_ball)
 
     def bounding_box(self) -> Bounds:
         half = length(self.scale_tril)
         return Bounds(self.center - half, self.center + half)
 
+    def inflated(self, by: Tensor) -> Self:
+        # Not a share of T, which may be out of range beside a large amount. What `eroded` takes
+        # from the longer axes is added: `rounding` knows the shorter ones alone.
+        unit, scale_tril = self._in_units()
+        norm = spectral_norm_bound(self._inverse())
+        eps = 2 * EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        more = 1 + eps * norm * length(scale_tril.flatten(-2))
+        longer = unit + by.squeeze(-1) * norm * more
+        return type(self)(self.center, scale_tril * longer[..., None, None], validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        return (EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size()).unsqueeze(-1)
+
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = length(self.scale_tril.flatten(-2)) + length(self.center)
-        # An ellipsoid thinner than its rounding error must not turn inside out: what is left of it
-        # has no slack to speak of, so that it is dropped like an empty set.
+        # An ellipsoid thinner than its rounding error must not turn inside out. In a region it was
+        # inflated by more than that.
         unit, _ = self._in_units()
-        share = (1 - eps * (size / unit) * spectral_norm_bound(self._inverse())).clamp(min=eps)
+        relative = self._size() / unit
+        share = (1 - eps * relative * spectral_norm_bound(self._inverse())).clamp(min=eps)
         return type(self)(
             self.center, self.scale_tril * share[..., None, None], validate_args=False
         )
@@ -172,6 +193,10 @@ class Ellipsoid(ConstraintSet):
         unit, scale_tril = self._in_units()
         inverse = self._inverse()
         return Cone(inverse, -_solve(scale_tril, self.center), unit, spectral_norm_bound(inverse))
+
+    def _size(self) -> Tensor:
+        """Return the size of the numbers that enter, ``(*batch,)``."""
+        return length(self.scale_tril.flatten(-2)) + length(self.center)
 
     def _identity(self) -> Tensor:
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
@@ -189,6 +214,10 @@ class Ellipsoid(ConstraintSet):
         return solve_triangular(self._in_units()[1], self._identity(), upper=False)
 
 
+def _whitened_gauge(scale_tril: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
+    return of_ball(_solve(scale_tril, direction))
+
+
 def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
     return solve_triangular(scale_tril, vector.unsqueeze(-1), upper=False).squeeze(-1)
 
@@ -204,7 +233,7 @@ class TaskSpaceBall(ConstraintSet):
     Args:
         jacobian: J, ``(*batch, m, d)``, finite.
         offset: b, ``(*batch, m)``, finite.
-        radius: ``(*batch,)``, positive and finite.
+        radius: ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -216,7 +245,10 @@ class TaskSpaceBall(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "jacobian", self.jacobian.isinf(), "finite elements"
         yield "offset", self.offset.isinf(), "a finite offset"
-        yield "radius", (self.radius <= 0) | self.radius.isinf(), "a finite radius > 0"
+        far = self.offset.abs() / largest_value(self.dtype) > self._norm().unsqueeze(-1)
+        expected = f"an offset up to {largest_value(self.dtype):g} times the norm of the jacobian"
+        yield "offset", far, expected
+        yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
 
     def shape_problem(self) -> str | None:
         rows, components = self.jacobian.shape[-2], self.offset.shape[-1]
@@ -252,11 +284,22 @@ class TaskSpaceBall(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        radius = torch.sub(self.radius, self._size(magnitude), alpha=eps)
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        return (eps * self._size(magnitude) / self._norm()).unsqueeze(-1)
+
+    def inflated(self, by: Tensor) -> Self:
+        radius = self.radius + by.squeeze(-1) * self._norm()
+        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
+        """Return the size of the numbers that enter, ``(*batch,)``."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
         terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
-        size = self.radius + length(terms)
-        radius = torch.sub(self.radius, size, alpha=eps)
-        return type(self)(self.jacobian, self.offset, radius, validate_args=False)
+        return self.radius + length(terms)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         offset = -_image(self.jacobian, center)

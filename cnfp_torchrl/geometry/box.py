@@ -29,7 +29,7 @@ class Box(ConstraintSet):
 
     Args:
         low: lower bounds ``(*batch, d)``.
-        high: upper bounds ``(*batch, d)``, each greater than its lower bound.
+        high: upper bounds ``(*batch, d)``, none less than its lower bound.
     """
 
     low: Tensor
@@ -38,13 +38,26 @@ class Box(ConstraintSet):
     event_dims: ClassVar[Mapping[str, int]] = {"low": 1, "high": 1}
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield "low", self.low >= self.high, "low < high"
+        yield "low", self.low > self.high, "low <= high"
+        yield (
+            "low",
+            (self.low == self.high) & self.low.isinf(),
+            "low <= high, not the same infinity",
+        )
 
     def contains(self, action: Tensor) -> Tensor:
         return ((action >= self.low) & (action <= self.high)).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
         return torch.minimum(self.high - action, action - self.low).amin(-1)
+
+    def row_slacks(self, action: Tensor) -> Tensor:
+        """Return the distances to the high bounds, then to the low bounds, ``(*batch, 2d)``."""
+        return torch.cat(torch.broadcast_tensors(self.high - action, action - self.low), -1)
+
+    def inflated(self, by: Tensor) -> Self:
+        above, below = (by, by) if by.shape[-1] == 1 else by.chunk(2, -1)
+        return type(self)(self.low - below, self.high + above, validate_args=False)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
@@ -61,11 +74,17 @@ class Box(ConstraintSet):
         return torch.maximum(self.low.abs(), self.high.abs()).amax(-1)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.low.device)
-        size = torch.minimum(torch.maximum(self.low.abs(), self.high.abs()), largest.unsqueeze(-1))
+        eps, size = EROSION_IN_EPS * torch.finfo(self.dtype).eps, self._size(magnitude)
         low, high = torch.add(self.low, size, alpha=eps), torch.sub(self.high, size, alpha=eps)
         return type(self)(low, high, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        moved = EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size(magnitude)
+        return torch.cat([moved, moved], -1)
+
+    def _size(self, magnitude: Tensor | float) -> Tensor:
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.low.device)
+        return torch.minimum(torch.maximum(self.low.abs(), self.high.abs()), largest.unsqueeze(-1))
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         half = radius.unsqueeze(-1)

@@ -70,6 +70,9 @@ class ConstraintSet(ABC):
     and, where there is more to say than the defaults do,
 
     - `gauge_about`: the gauge with all that does not depend on the direction computed once,
+    - `inflated`: the set widened, so that a constraint that cannot be had gives way by the least
+      amount; without it, it is dropped where it cannot be had,
+    - `row_slacks`, `rounding`: where the set is made of several rows, which give way one by one,
     - `invalid_fields`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
     - `superlevel`: what the search for anchors needs to be fast, `part_near` if not convex.
@@ -126,6 +129,46 @@ class ConstraintSet(ABC):
             center: of the ball, ``(*batch, d)``.
             radius: of the ball, ``(*batch,)``, positive.
         """
+
+    def inflated(self, by: Tensor) -> Self:
+        """Return the set widened to all actions with a slack of at least ``-by``.
+
+        Only families that override this can be relaxed; one that does not, such as a non-convex
+        one, is dropped where it cannot be had.
+
+        Args:
+            by: amounts in units of the slack, ``(*batch, m)`` for the m rows of `row_slacks` or
+                ``(*batch, 1)`` for all of them alike; finite, 0 or more.
+
+        Raises:
+            TypeError: when the family cannot be widened.
+        """
+        raise TypeError(f"{type(self).__name__}: expected a family that states `inflated`")
+
+    @classmethod
+    def can_be_inflated(cls) -> bool:
+        """Tell whether the family states `inflated`."""
+        return cls.inflated is not ConstraintSet.inflated
+
+    @classmethod
+    def has_rows(cls) -> bool:
+        """Tell whether sets of the family are made of several rows, see `row_slacks`."""
+        return cls.row_slacks is not ConstraintSet.row_slacks
+
+    def row_slacks(self, action: Tensor) -> Tensor:
+        """Return the slacks of the rows that a set is made of, ``(*batch, m)``.
+
+        Their least is `slack`; by default the set is one row.
+        """
+        return self.slack(action).unsqueeze(-1)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        """Return how far `eroded` moves the boundary of each row inwards, ``(*batch, m)``."""
+        like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
+        zero = like.new_zeros(self.dim)
+        moved = self.row_slacks(zero) - self.eroded(magnitude).row_slacks(zero)
+        # Rows that let every action pass, and a set that has no slack at 0, say nothing.
+        return moved.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
         """Return the gauge about an anchor, for many directions: what they share is computed once.

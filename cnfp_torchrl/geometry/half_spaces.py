@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    largest_value,
+)
 from cnfp_torchrl.geometry.norms import power_of_two
 from cnfp_torchrl.geometry.superlevel import Rows
 
@@ -22,7 +28,8 @@ class HalfSpaces(ConstraintSet):
 
     It need not be bounded. A control barrier function gives one row,
     :math:`-L_g h \cdot a \le L_f h + \alpha(h)`. A row whose normal is zero lets every action pass
-    where its offset is 0 or more, and none where it is less: there the constraint cannot hold.
+    where its offset is 0 or more, and none where it is less: there it is relaxed by as much. Rows
+    are relaxed one by one, each by a distance.
 
     Args:
         normals: ``(*batch, m, d)``, finite.
@@ -37,6 +44,9 @@ class HalfSpaces(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
+        size, most = self.normals.abs().amax(-1), largest_value(self.dtype)
+        far = (-self.offsets / most > size) & (size > 0)
+        yield "offsets", far, f"an offset above {-most:g} times the normal's largest element"
 
     def shape_problem(self) -> str | None:
         rows, offsets = self.normals.shape[-2], self.offsets.shape[-1]
@@ -53,8 +63,22 @@ class HalfSpaces(ConstraintSet):
         return (_rows(sets.normals, action.double()) <= sets.offsets).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
+        return self.row_slacks(action).amin(-1)
+
+    def row_slacks(self, action: Tensor) -> Tensor:
+        """Return the distances to the rows' boundaries, ``(*batch, m)``."""
         rows = self.superlevel()
-        return ((rows.offsets - _rows(rows.normals, action)) / rows.rates).amin(-1)
+        return (rows.offsets - _rows(rows.normals, action)) / rows.rates
+
+    def inflated(self, by: Tensor) -> Self:
+        rows = self.superlevel()
+        return type(self)(rows.normals, rows.offsets + by * rows.rates, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        rows, eps = self.superlevel(), EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
+        size = rows.normals.abs().sum(-1) * largest.unsqueeze(-1) + rows.offsets.abs()
+        return (eps * size / rows.rates).masked_fill(rows.offsets.isinf(), 0)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)

@@ -152,11 +152,12 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
 
 
 def _split(region: Region) -> tuple[Box, list[tuple[ConstraintSet, Tensor | None]]]:
-    """Return the box of all active boxes, and the other sets with their flags ``(*batch, 1)``."""
+    """Return the box of all boxes, and the other sets with where they count ``(*batch, 1)``."""
     low, high = region.bounds.low, region.bounds.high
     others: list[tuple[ConstraintSet, Tensor | None]] = []
-    for stage, each in enumerate(region.sets[1:], 1):
-        active = None if region.active is None else region.active[..., stage].unsqueeze(-1)
+    for stage, each in enumerate(region.widened()[1:], 1):
+        counts = region.counts(stage)
+        active = None if counts is None else counts.unsqueeze(-1)
         if isinstance(each, Box):
             lower, upper = each.low, each.high
             if active is not None:

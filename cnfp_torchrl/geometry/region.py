@@ -15,21 +15,29 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, b
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The intersection of the action bounds with the active ones of K constraint sets.
+    """The intersection of the action bounds with K constraint sets, widened where they are relaxed.
+
+    A set holds as stated where it is active. Elsewhere it is widened by its relaxation, row by row,
+    and adds nothing where that is infinite or unknown: there it is dropped.
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        anchor: a point strictly inside all active sets, ``(*batch, d)``.
+        anchor: a point strictly inside all sets that are not dropped, ``(*batch, d)``.
         active: which sets hold in which state, boolean ``(*batch, K + 1)``; None means all.
+        relaxation: by how much the rows of each set are widened, ``(*batch, m)`` a set, as
+            `lexicographic_anchor` finds it: 0 where the set is active. None means that all sets
+            that are not active are dropped.
 
     Raises:
-        GeometryError: when the first set is not a box or the dimensions differ.
+        GeometryError: when the first set is not a box, or dimensions or the number of relaxations
+            differ.
     """
 
     sets: tuple[ConstraintSet, ...]
     anchor: Tensor
     active: Tensor | None = None
+    relaxation: tuple[Tensor, ...] | None = None
     validate_args: InitVar[bool] = True
 
     def __post_init__(self, validate_args: bool) -> None:
@@ -42,6 +50,11 @@ class Region:
         if len(set(dims)) > 1:
             raise GeometryError(
                 f"sets and anchor: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
+            )
+        if self.relaxation is not None and len(self.relaxation) != len(self.sets):
+            raise GeometryError(
+                f"relaxation: expected amounts for each of the {len(self.sets)} sets, bounds "
+                f"included, given {len(self.relaxation)}"
             )
 
     @property
@@ -65,24 +78,48 @@ class Region:
         """Return the region with sets and anchor in a dtype, all of it on a device."""
         sets = tuple(each.to(dtype, device) for each in self.sets)
         active = None if self.active is None else self.active.to(device)
-        return type(self)(sets, self.anchor.to(device, dtype), active, validate_args=False)
+        amounts = self.relaxation
+        if amounts is not None:
+            amounts = tuple(each.to(device, dtype) for each in amounts)
+        return type(self)(sets, self.anchor.to(device, dtype), active, amounts, validate_args=False)
+
+    def widened(self) -> tuple[ConstraintSet, ...]:
+        """Return the sets, each widened by its relaxation; dropped ones as they are."""
+        if self.relaxation is None:
+            return self.sets
+        return (
+            self.bounds,
+            *(
+                each.inflated(amount) if each.can_be_inflated() else each
+                for each, amount in zip(self.sets[1:], self.relaxation[1:], strict=True)
+            ),
+        )
+
+    def counts(self, stage: int) -> Tensor | None:
+        """Return where a set holds or is relaxed, boolean ``(*batch,)``; None means everywhere."""
+        if stage == 0 or self.active is None:
+            return None
+        if self.relaxation is not None and self.sets[stage].can_be_inflated():
+            return None
+        return self.active[..., stage]
 
     def gauges(self, direction: Tensor) -> Tensor:
         """Return the gauge of the region after each stage, ``(K + 1, *batch)``.
 
         The gauge of an intersection is the maximum of the gauges, so this is a running maximum; a
-        set that is not active adds nothing.
+        set that is dropped adds nothing.
         """
-        running = [self.sets[0].gauge(direction, self.anchor)]
-        for stage in range(1, len(self.sets)):
-            running.append(torch.maximum(running[-1], self._gauge(stage, direction)))
+        running: list[Tensor] = []
+        for gauge in self._gauges(direction):
+            running.append(torch.maximum(running[-1], gauge) if running else gauge)
         return torch.stack(torch.broadcast_tensors(*running))
 
     def outer_and_inner_gauge(self, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gauges of the action bounds and of the whole region, each ``(*batch,)``."""
-        outer = inner = self.sets[0].gauge(direction, self.anchor)
-        for stage in range(1, len(self.sets)):
-            inner = torch.maximum(inner, self._gauge(stage, direction))
+        outer, *others = self._gauges(direction)
+        inner = outer
+        for gauge in others:
+            inner = torch.maximum(inner, gauge)
         return outer, inner
 
     def pulled_in(self, point: Tensor) -> Tensor:
@@ -101,25 +138,26 @@ class Region:
         return self.anchor + share.unsqueeze(-1) * offset
 
     def contains(self, action: Tensor) -> Tensor:
-        """Tell, with zero tolerance, whether each action lies in every active set."""
-        inside = self.sets[0].contains(action)
-        for stage in range(1, len(self.sets)):
-            inside = inside & self._unless_dropped(stage, self.sets[stage].contains(action), True)
+        """Tell, with zero tolerance, whether each action lies in every set, relaxed or not."""
+        inside = self.bounds.contains(action)
+        for stage, each in enumerate(self.widened()[1:], 1):
+            inside = inside & self._unless_dropped(stage, each.contains(action), True)
         return inside
 
     def slack(self, action: Tensor) -> Tensor:
-        """Return the smallest slack of the active sets, ``(*batch,)``."""
-        least = self.sets[0].slack(action)
-        for stage in range(1, len(self.sets)):
-            slack = self._unless_dropped(stage, self.sets[stage].slack(action), torch.inf)
+        """Return the smallest slack in the sets, relaxed or not, ``(*batch,)``."""
+        least = self.bounds.slack(action)
+        for stage, each in enumerate(self.widened()[1:], 1):
+            slack = self._unless_dropped(stage, each.slack(action), torch.inf)
             least = torch.minimum(least, slack)
         return least
 
     def eroded(self) -> Self:
         """Return the region whose points, computed in its dtype, lie in this one exactly.
 
-        A dropped set is replaced by one of its family that reaches beyond the action bounds, so
-        that all sets of the result are active: nothing needs a mask, and no gradient is NaN.
+        Relaxed sets are widened before. A dropped set is replaced by one of its family that reaches
+        beyond the action bounds, so that all sets of the result are active: nothing needs a mask,
+        and no gradient is NaN.
 
         Raises:
             GeometryError: when sets and anchor have several dtypes, in the coarser ones of which
@@ -132,35 +170,40 @@ class Region:
                 "convert them with .to(dtype)"
             )
         magnitude = self.bounds.magnitude()
-        sets = [each.eroded(magnitude) for each in self.sets]
-        if self.active is not None:
-            # No two points of the bounds are further apart than half of it.
-            beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
-            for stage in range(1, len(sets)):
-                active = self.active[..., stage]
-                sets[stage] = sets[stage].unless_dropped(active, self.anchor, beyond)
+        sets = [each.eroded(magnitude) for each in self.widened()]
+        # No two points of the bounds are further apart than half of it.
+        beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
+        for stage in range(1, len(sets)):
+            counts = self.counts(stage)
+            if counts is not None:
+                sets[stage] = sets[stage].unless_dropped(counts, self.anchor, beyond)
         return type(self)(tuple(sets), self.anchor, validate_args=False)
 
     @classmethod
-    def build(cls, sets: Sequence[ConstraintSet], anchor: Tensor | None = None) -> Self:
-        """Find anchor and active flags by the lexicographic rule, highest priority first.
+    def build(
+        cls,
+        sets: Sequence[ConstraintSet],
+        candidate: Tensor | None = None,
+        leeway: float | None = None,
+    ) -> Self:
+        """Find anchor, active flags and relaxations by the lexicographic rule.
 
-        See `cnfp_torchrl.geometry.anchors.lexicographic_anchor`.
+        See `cnfp_torchrl.geometry.lexicographic_anchor`, whose arguments these are.
         """
-        from cnfp_torchrl.geometry.anchors import lexicographic_anchor
+        from cnfp_torchrl.geometry.anchor import LEEWAY, lexicographic_anchor
 
         if sets and isinstance(sets[0], Box):
             require_action_bounds(sets[0])
-        point, active = lexicographic_anchor(sets, anchor)
-        return cls(tuple(sets), point, active)
+        found = lexicographic_anchor(sets, candidate, LEEWAY if leeway is None else leeway)
+        return cls(tuple(sets), found.anchor, found.active, found.relaxation)
 
-    def _gauge(self, stage: int, direction: Tensor) -> Tensor:
-        return self._unless_dropped(stage, self.sets[stage].gauge(direction, self.anchor), 0.0)
+    def _gauges(self, direction: Tensor) -> list[Tensor]:
+        gauges = [each.gauge(direction, self.anchor) for each in self.widened()]
+        return [self._unless_dropped(stage, gauge, 0.0) for stage, gauge in enumerate(gauges)]
 
     def _unless_dropped(self, stage: int, value: Tensor, neutral: float | bool) -> Tensor:
-        if self.active is None:
-            return value
-        return torch.where(self.active[..., stage], value, neutral)
+        counts = self.counts(stage)
+        return value if counts is None else torch.where(counts, value, neutral)
 
 
 def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:

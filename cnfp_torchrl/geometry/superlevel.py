@@ -1,8 +1,8 @@
 r"""Descriptions of superlevel sets :math:`\{a : slack(a) \ge t\}`, by which anchors are found.
 
-A convex family states one of them in `ConstraintSet.superlevel`. The solver
-(`cnfp_torchrl.geometry.barrier`) knows the logarithmic barrier of each kind, so a family needs no
-derivatives of its own.
+A convex family states one of them in `ConstraintSet.superlevel`. Newton's method
+(`cnfp_torchrl.geometry.anchor`) knows the derivatives of each kind, so a family needs none of its
+own.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class KinkedSumBound(ConstraintSet):
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, positive and finite.
+        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
     """
 
     weights: Tensor
@@ -44,7 +44,7 @@ class KinkedSumBound(ConstraintSet):
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "weights", self.weights.isinf(), "a finite weight"
-        yield "bound", (self.bound <= 0) | self.bound.isinf(), "a finite bound > 0"
+        yield "bound", (self.bound < 0) | self.bound.isinf(), "a finite bound >= 0"
 
     def contains(self, action: Tensor) -> Tensor:
         sets = self.to(torch.float64)._normalized()
@@ -53,7 +53,15 @@ class KinkedSumBound(ConstraintSet):
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(bound - sum) / |weights|``; infinite where all weights are zero."""
         sets = self._normalized()
-        return (sets.bound - sets._total(action)) / vector_norm(sets.weights, dim=-1)
+        lengths = vector_norm(sets.weights, dim=-1)
+        free = lengths == 0
+        slack = (sets.bound - sets._total(action)) / lengths.masked_fill(free, 1)
+        return slack.masked_fill(free, torch.inf)
+
+    def inflated(self, by: Tensor) -> Self:
+        sets = self._normalized()
+        bound = sets.bound + by.squeeze(-1) * vector_norm(sets.weights, dim=-1)
+        return type(self)(sets.weights, bound, validate_args=False)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         r"""Return the gauge about an anchor, in O(d log d).
@@ -66,6 +74,8 @@ class KinkedSumBound(ConstraintSet):
         sets = self._normalized()
         side = sets._side_at_exit(direction.detach(), anchor.detach())
         room = sets.bound - (side * anchor).sum(-1)
+        # Without weights the set has no end, and a bound of 0 leaves no room to divide by.
+        room = room.masked_fill((sets.weights == 0).all(-1), 1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
     def bounding_box(self) -> Bounds:
@@ -128,7 +138,7 @@ class WeightedL1Ball(KinkedSumBound):
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, positive and finite.
+        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
     """
 
     @staticmethod
@@ -152,7 +162,7 @@ class PositivePart(KinkedSumBound):
 
     Args:
         weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, positive and finite.
+        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
     """
 
     @staticmethod

@@ -11,7 +11,8 @@ from cnfp_torchrl.modules.actors import (
     with_reference_entropy,
 )
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.exploration import refuse_exploration
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, LostDensityWarning
 from cnfp_torchrl.modules.flows import (
     ExactFlow,
     Flow,
@@ -47,6 +48,7 @@ __all__ = [
     "FlowMap",
     "GaugeFlow",
     "LatentActor",
+    "LostDensityWarning",
     "MissingGeometryError",
     "ProjectionFlow",
     "RadialFlow",
@@ -64,6 +66,7 @@ __all__ = [
     "has_density",
     "in_order",
     "make_constrained_actor",
+    "refuse_exploration",
     "refuse_other_bounds",
     "refuse_violations",
     "split_at_latent",

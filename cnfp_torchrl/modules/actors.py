@@ -21,6 +21,7 @@ from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.keys import ACTION_KEY, LOC_KEY, SCALE_KEY, refuse_string
 from cnfp_torchrl.modules.action_bounds import action_bounds, refuse_other_bounds
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
+from cnfp_torchrl.modules.exploration import refuse_exploration
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, ReferenceEntropyFlowModule
 from cnfp_torchrl.modules.flows import Flow
 from cnfp_torchrl.modules.publisher import constraint_bijectors
@@ -253,6 +254,8 @@ def actor_modules(actor: ProbabilisticTensorDictSequential) -> list[Any]:
         TypeError: when the actor is no sequence that ends in a probabilistic module.
     """
     if not isinstance(actor, ProbabilisticTensorDictSequential):
+        if isinstance(actor, nn.Module):
+            refuse_exploration(actor)
         raise TypeError(
             "actor: expected a sequence that ends in a probabilistic module, such as a "
             f"ProbabilisticActor, given {type(actor).__name__}"

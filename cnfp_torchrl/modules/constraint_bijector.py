@@ -16,7 +16,9 @@ from cnfp_torchrl.keys import (
     active_key,
     field_key,
     refuse_string,
+    relaxation_key,
     require,
+    row_relaxation_key,
 )
 
 
@@ -63,6 +65,21 @@ class ConstraintBijector(TensorDictModuleBase):
     def active_key(self) -> NestedKey:
         """Where `ConstraintAnchor` says whether the constraint holds in a state."""
         return active_key(self.name)
+
+    @property
+    def relaxation_key(self) -> NestedKey:
+        """Where `ConstraintAnchor` says by how much the constraint had to be widened in a state."""
+        return relaxation_key(self.name)
+
+    @property
+    def row_relaxation_key(self) -> NestedKey | None:
+        """Where it says so row by row, if the family has rows."""
+        return row_relaxation_key(self.name) if self.set_type.has_rows() else None
+
+    @property
+    def amounts_key(self) -> NestedKey:
+        """Where the amounts are by which a flow widens the set, row by row if there are rows."""
+        return self.row_relaxation_key or self.relaxation_key
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the sets of allowed actions; their values were checked when published.

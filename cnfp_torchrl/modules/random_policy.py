@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
@@ -16,7 +19,7 @@ class SafeRandomPolicy(TensorDictModuleBase):
     the flow module writes, and location 0 and scale 1 where a network would write its own.
 
     Args:
-        actor: a constrained one; its networks are not asked.
+        actor: A constrained actor; its networks are not asked.
 
     Raises:
         TypeError: when the actor is not a constrained one.
@@ -38,11 +41,12 @@ class WarmUpPolicy(TensorDictModuleBase):
 
     Takes the place of a collector's ``init_random_frames``, whose actions are not constrained. A
     collector tries its policy once when it is made, which counts as one action of each batch
-    element; to begin anew, set `frames_left`. Each process of a distributed collector counts alone.
+    element; to begin anew, set ``frames_left``. Each process of a distributed collector counts
+    alone.
 
     Args:
-        actor: a constrained actor.
-        frames: number of actions, over all batch elements, before the actor takes over.
+        actor: A constrained actor.
+        frames: The number of actions, over all batch elements, before the actor takes over.
     """
 
     def __init__(self, actor: SafeProbabilisticTensorDictSequential, frames: int) -> None:
@@ -51,13 +55,31 @@ class WarmUpPolicy(TensorDictModuleBase):
             raise ValueError(f"frames: expected a number >= 0, given {frames}")
         self.actor = actor
         self.random = SafeRandomPolicy(actor)
-        self.frames_left = frames
+        # Not a number, for each value of which a policy would be compiled anew. On the host, where
+        # asking it does not wait for an accelerator.
+        self._frames_left = torch.tensor(frames)
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+
+    @property
+    def frames_left(self) -> int:
+        """The number of random actions to come."""
+        return max(int(self._frames_left), 0)
+
+    @frames_left.setter
+    def frames_left(self, frames: int) -> None:
+        self._frames_left = torch.tensor(frames)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A tensor would be shared by the processes to which the policy is sent.
+        return {**super().__getstate__(), "_frames_left": int(self._frames_left)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "_frames_left": torch.tensor(state["_frames_left"])})
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of the policy whose turn it is."""
-        if self.frames_left > 0:
-            self.frames_left -= max(tensordict.numel(), 1)
+        if self._frames_left > 0:
+            self._frames_left -= max(tensordict.numel(), 1)
             # The actor runs too, for keys of its own besides the Gaussian's parameters: every step
             # must carry the same ones.
             self.actor(tensordict)

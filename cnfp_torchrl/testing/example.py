@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry import MINIMUM_SLACK, Box, ConstraintSet
+from cnfp_torchrl.geometry import Box, ConstraintSet, row_depths
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -129,18 +129,20 @@ class Example:
         gauge that subtracts large numbers is worst.
         """
         given = self.views[0].anchor
-        twice = [each.to(torch.float32) for each in (self.bounds, self.sets)]
-        magnitude = self.bounds.to(torch.float32).magnitude()
-        twice = [each.eroded(magnitude).eroded(magnitude) for each in twice]
-        twice = [each.to(torch.float64) for each in twice]
+        # In float32, where an anchor keeps the larger depth.
+        depths = row_depths([each.to(torch.float32) for each in (self.bounds, self.sets)])
+        both = (self.bounds, self.sets)
         views = [self.views[0]]
         for way in self.ways(4):
-            gauge = torch.maximum(*(each.gauge(way, given) for each in twice)).unsqueeze(-1)
+            gauge = torch.maximum(*(each.gauge(way, given) for each in both)).unsqueeze(-1)
             anchor = given
             for depth in _DEPTHS:
                 trial = _rounded(given + way * (1 - depth) / gauge)
-                slack = torch.minimum(*(each.slack(trial) for each in twice)).unsqueeze(-1)
-                anchor = torch.where(slack >= MINIMUM_SLACK, trial, anchor)
+                rooms = [
+                    (each.row_slacks(trial) - depth).amin(-1, keepdim=True)
+                    for each, depth in zip(both, depths, strict=True)
+                ]
+                anchor = torch.where(torch.minimum(*rooms) >= 0, trial, anchor)
             views.append(self.view(anchor, self._ways_about(anchor - given, samples)))
         return replace(self, views=tuple(views))
 

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry import (
-    MINIMUM_SLACK,
     Box,
     Cone,
     ConstraintSet,
@@ -17,6 +16,7 @@ from cnfp_torchrl.geometry import (
     Rows,
     Superlevel,
     lexicographic_anchor,
+    row_depths,
 )
 from cnfp_torchrl.testing.example import Example
 from cnfp_torchrl.testing.family_error import FamilyError, called, require
@@ -156,10 +156,14 @@ def check_search_keeps_the_set(example: Example) -> None:
     """The search for anchors keeps the set wherever the given anchor has slack enough."""
     sets, bounds, anchor = example.sets, example.bounds, example.views[0].anchor
     method = "slack" if sets.superlevel() is None else "superlevel"
-    twice = [each.eroded(example.size).eroded(example.size) for each in (bounds, sets)]
-    slack = torch.minimum(*(each.slack(anchor) for each in twice))
-    _, active = called(type(sets), method, lambda: lexicographic_anchor([bounds, sets]))
-    kept = active[..., 1] | (slack < 2 * MINIMUM_SLACK)
+    depths = row_depths([bounds, sets])
+    rooms = [
+        (each.row_slacks(anchor) - 2 * depth).amin(-1)
+        for each, depth in zip((bounds, sets), depths, strict=True)
+    ]
+    slack = torch.minimum(*rooms)
+    found = called(type(sets), method, lambda: lexicographic_anchor([bounds, sets]))
+    kept = found.active[..., 1] | (slack < 0)
     expected = "the search for anchors to keep the set wherever an anchor has slack enough"
     require(sets, method, kept, expected, "a slack of", slack, anchor=anchor)
 

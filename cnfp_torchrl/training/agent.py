@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
-from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
 from cnfp_torchrl.modules import Flow, make_constrained_actor
 from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
 from cnfp_torchrl.training.environment import counted_constraints, make_environment
@@ -27,35 +27,39 @@ def build_environment(
     """Return the environment of a configuration.
 
     Args:
-        config: with sections ``env`` and ``flow``.
-        batch_size: replaces the batch size of environments that have one.
+        config: configuration with the sections ``env`` and ``flow``.
+        batch_size: batch size of environments that have one; None takes that of the configuration.
         with_anchor: publish anchor and active flags also where the flow does not need them.
-        with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
+        with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
-
-    Raises:
-        ValueError: when the environment has no geometry of the name ``flow.obstacle``.
     """
-    _require_obstacle(config)
-    flow: Flow = instantiate(config.flow.combine)
+    flow: Flow = instantiate(config.flow)
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
     return make_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
-        {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
-        order=list(config.flow.order),
+        {
+            name: instantiate(section, _convert_="all")
+            for name, section in config.env.geometry.items()
+        },
+        order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
-        penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
+        penalty=_penalty(config) if with_penalty else None,
     )
 
 
-def _require_obstacle(config: DictConfig) -> None:
-    choices = config.env.get("obstacle_geometry")
-    if choices is not None and config.flow.obstacle not in choices:
-        raise ValueError(
-            f"flow.obstacle: expected one of {list(choices)}, given {config.flow.obstacle!r}"
-        )
+def _penalty(config: DictConfig) -> RewardPenalty | None:
+    """Return what violations cost in training; a number serves as well, and 0 is none."""
+    penalty = config.env.get("penalty")
+    if isinstance(penalty, int | float):
+        return RewardPenalty(penalty) if penalty else None
+    return instantiate(penalty)
+
+
+def application_order(config: DictConfig) -> list[str]:
+    """Return the constraints in order of application: ``env.order``, else that of the geometry."""
+    return list(config.env.get("order", config.env.geometry))
 
 
 def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
@@ -66,8 +70,8 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
         instantiate(config.network.actor, observation_size, action_size),
         bijectors=constraint_bijectors(env) if config.env.geometry else [],
         spec=env.action_spec_unbatched,
-        order=list(config.flow.order),
-        flow=instantiate(config.flow.combine),
+        order=application_order(config),
+        flow=instantiate(config.flow),
     )
 
 
@@ -115,7 +119,7 @@ def load_actor(
 
     Args:
         folder: the run.
-        config: its configuration, from `RunFolder.load_config`.
+        config: the run's configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
 
     Raises:

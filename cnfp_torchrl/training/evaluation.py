@@ -8,13 +8,26 @@ from itertools import islice
 from typing import Any
 
 import torch
+from hydra.utils import instantiate
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cnfp_torchrl.configuration import require_fields
+from cnfp_torchrl.modules import (
+    ConstrainedFlowModule,
+    SafeRandomPolicy,
+    constrain,
+    flow_head,
+    guarded,
+)
+from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import counted_constraints
-from cnfp_torchrl.training.settings import NUMBER, EvaluationSettings
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 """Writes the action into a tensordict of states: any TorchRL policy."""
@@ -36,8 +49,7 @@ class LinearScore:
     one: float
 
     def __post_init__(self) -> None:
-        NUMBER.require("env.score.zero", self.zero)
-        NUMBER.require("env.score.one", self.one)
+        require_fields("env.score", self)
         if self.zero == self.one:
             raise ValueError(
                 f"env.score.one: expected another return than env.score.zero, given {self.one} for "
@@ -49,6 +61,26 @@ class LinearScore:
         return (return_mean - self.zero) / (self.one - self.zero)
 
 
+class StandStill(TensorDictModuleBase):
+    """Always the zero action.
+
+    Args:
+        head: the flow module of an actor, which knows the action's key and size.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule) -> None:
+        super().__init__()
+        self.head = head
+        self.in_keys: list[NestedKey] = []
+        self.out_keys = [head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write zeros."""
+        bounds = self.head.bounds
+        zeros = bounds.low.new_zeros(*tensordict.shape, bounds.dim)
+        return tensordict.set(self.head.action_key, zeros)
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """What happened in a number of whole episodes.
@@ -57,7 +89,7 @@ class Evaluation:
         returns: undiscounted return of each episode, ``(episodes,)``.
         costs: violations of each episode by constraint, ``(episodes, K)``.
         names: the constraints' names.
-        steps: steps taken in all.
+        steps: number of steps taken in all.
     """
 
     returns: Tensor
@@ -92,7 +124,7 @@ def evaluate_seeded(
     settings: EvaluationSettings,
     *,
     deterministic: bool = False,
-    see: Callable[[TensorDictBase], None] | None = None,
+    on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Run the episodes that a seed determines: starts, goals and what the policy draws.
 
@@ -101,11 +133,13 @@ def evaluate_seeded(
         policy: see `evaluate`.
         settings: number of episodes and the seed.
         deterministic: see `evaluate`.
-        see: see `evaluate`.
+        on_step: see `evaluate`.
     """
     env.set_seed(settings.seed)
     torch.manual_seed(settings.seed)
-    return evaluate(env, policy, episodes=settings.episodes, deterministic=deterministic, see=see)
+    return evaluate(
+        env, policy, episodes=settings.episodes, deterministic=deterministic, on_step=on_step
+    )
 
 
 @torch.no_grad()
@@ -116,17 +150,18 @@ def evaluate(
     episodes: int,
     deterministic: bool = False,
     max_steps: int = 10_000,
-    see: Callable[[TensorDictBase], None] | None = None,
+    on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Run a policy for whole episodes and count.
 
     Args:
-        env: any batch size; as many batches are run as the episodes need, the first ones count.
-        policy: writes ``action``.
-        episodes: how many.
+        env: environment of any batch size; as many batches are run as the episodes need, of which
+            the first episodes count.
+        policy: any TorchRL policy.
+        episodes: number of episodes.
         deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
-        max_steps: a longer episode is an error: the environment never ends.
-        see: is shown every transition of every batch, of the environment's batch size.
+        max_steps: length beyond which an episode counts as endless.
+        on_step: function that gets every transition, of the environment's batch size.
 
     Raises:
         ValueError: when `episodes` is not positive.
@@ -137,24 +172,19 @@ def evaluate(
         raise ValueError(f"episodes: expected a number >= 1, given {episodes}")
     names = counted_constraints(env)
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    returns: list[Tensor] = []
-    costs: list[Tensor] = []
-    steps = 0
+    batches: list[Evaluation] = []
     with set_exploration_type(mode):
-        while sum(len(each) for each in returns) < episodes:
-            shown = _shown(transitions(env, policy), see)
-            batch_return, batch_cost, batch_steps = _run_batch(env, shown, len(names), max_steps)
-            returns.append(batch_return)
-            costs.append(batch_cost)
-            steps += batch_steps
-    kept = torch.cat(returns)[:episodes]
-    if not bool(kept.isfinite().all()):
-        broken = int((~kept.isfinite()).sum())
+        while sum(len(batch.returns) for batch in batches) < episodes:
+            batches.append(_run_batch(env, policy, names, max_steps, on_step))
+    returns = torch.cat([batch.returns for batch in batches])[:episodes]
+    if not bool(returns.isfinite().all()):
+        broken = int((~returns.isfinite()).sum())
         raise FloatingPointError(
             f"return: expected finite numbers, but those of {broken} of {episodes} episodes are "
             "not; look at the environment's reward and at the policy's parameters"
         )
-    return Evaluation(kept, torch.cat(costs)[:episodes], names, steps)
+    costs = torch.cat([batch.costs for batch in batches])[:episodes]
+    return Evaluation(returns, costs, names, sum(batch.steps for batch in batches))
 
 
 def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
@@ -165,33 +195,62 @@ def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
         yield transition
 
 
-def _shown(
-    steps: Iterator[TensorDictBase], see: Callable[[TensorDictBase], None] | None
-) -> Iterator[TensorDictBase]:
-    for transition in steps:
-        if see is not None:
-            see(transition)
-        yield transition
-
-
 def _run_batch(
-    env: EnvBase, stream: Iterator[TensorDictBase], constraints: int, max_steps: int
-) -> tuple[Tensor, Tensor, int]:
+    env: EnvBase,
+    policy: Policy,
+    names: tuple[str, ...],
+    max_steps: int,
+    on_step: Callable[[TensorDictBase], None] | None,
+) -> Evaluation:
+    """Run one episode of every agent."""
     size = env.batch_size.numel()
     running = torch.ones(size, dtype=torch.bool, device=env.device)
     returns = torch.zeros(size, device=env.device)
-    costs = torch.zeros(size, constraints, device=env.device)
+    costs = torch.zeros(size, len(names), device=env.device)
     steps = 0
-    for transition in islice(stream, max_steps):
+    for transition in islice(transitions(env, policy), max_steps):
+        if on_step is not None:
+            on_step(transition)
         outcome = transition.get("next")
         returns += running * outcome.get("reward").reshape(size)
-        if constraints:
-            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(size, constraints)
+        if names:
+            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(size, len(names))
         steps += int(running.sum())
         running = running & ~outcome.get("done").reshape(size)
         if not bool(running.any()):
-            return returns.cpu(), costs.cpu(), steps
+            return Evaluation(returns.cpu(), costs.cpu(), names, steps)
     raise RuntimeError(
         f"max_steps: expected every episode to end within {max_steps} steps, but "
         f"{int(running.sum())} of {size} go on; truncate the environment"
     )
+
+
+def evaluate_run(
+    folder: RunFolder, settings: EvaluationSettings, *, trusted: tuple[str, ...] = ()
+) -> dict[str, dict[str, Any]]:
+    """Return the report of the trained policy and of each baseline.
+
+    Args:
+        folder: a finished run.
+        settings: number of episodes and the seed, the same for all.
+        trusted: see `RunFolder.load_config`.
+    """
+    config = folder.load_config(trusted)
+    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
+    actor = load_actor(folder, config, env)
+    safe = constrain(actor, flow="exact")
+    exact = flow_head(safe)
+    score = instantiate(config.env.get("score"))
+    policies: dict[str, tuple[Policy, bool]] = {
+        "trained, stochastic": (guarded(actor, env), False),
+        "trained, deterministic": (guarded(actor, env), True),
+        "safe random": (SafeRandomPolicy(safe), False),
+        "standing still": (StandStill(exact), False),
+    }
+    for name, make in instantiate(config.env.get("baselines") or {}).items():
+        policies[name] = (make(exact), False)
+    reports = {}
+    for name, (policy, deterministic) in policies.items():
+        result = evaluate_seeded(env, policy, settings, deterministic=deterministic)
+        reports[name] = result.report(score)
+    return reports

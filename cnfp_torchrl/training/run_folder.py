@@ -1,9 +1,8 @@
-"""What a run leaves behind, and how it is read back without trusting it."""
+"""The folder of a run: what training writes, and reading it back without trust."""
 
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import pickle
 import weakref
@@ -15,8 +14,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from cnfp_torchrl.training.trust import BUILT, read_plain, require_trusted, targets
-from cnfp_torchrl.whole_file import whole_file
+from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
+from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
 
@@ -94,7 +93,8 @@ class RunFolder:
         Raises:
             FileExistsError: when another run has written its own in the meantime.
         """
-        self._write(CONFIG, OmegaConf.to_yaml(config, resolve=True), exclusive=True)
+        with whole_file(self.path / CONFIG, exclusive=True) as file:
+            file.write(OmegaConf.to_yaml(config, resolve=True).encode())
 
     def load_settings(self) -> dict[str, Any]:
         """Read the configuration as plain data, to be compared or shown but not built.
@@ -114,15 +114,20 @@ class RunFolder:
                 configuration names, such as ``my_package.envs.``.
 
         Raises:
-            ValueError: when it is not plain YAML or lacks a section.
+            ValueError: when it is not plain YAML, lacks a section, or is of version 0.1.
             PermissionError: when it would do anything else than build what it may name.
         """
         path = self.path / CONFIG
         content = read_plain(path)
-        if missing := [each for each in BUILT[:3] if each not in content]:
+        if missing := [name for name in BUILT[:3] if name not in content]:
             raise ValueError(
                 f"{path}: expected the sections {list(BUILT[:3])} of a training run, but {missing} "
                 "are missing; give the folder that training printed when it ended"
+            )
+        if isinstance(content["flow"], dict) and "combine" in content["flow"]:
+            raise ValueError(
+                f"{path}: written by version 0.1, whose configurations have other names; evaluate "
+                "the run with that version, or train it again"
             )
         content = {
             name: section
@@ -185,8 +190,4 @@ class RunFolder:
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write the summary."""
-        self._write(SUMMARY, json.dumps(summary, indent=2, allow_nan=False) + "\n")
-
-    def _write(self, name: str, text: str, *, exclusive: bool = False) -> None:
-        with whole_file(self.path / name, exclusive=exclusive) as file:
-            file.write(text.encode())
+        write_json(self.path / SUMMARY, summary)

@@ -1,52 +1,48 @@
-"""Train a policy that cannot break its constraints: the command ``cnfp-train``."""
+"""Training of a policy that cannot break its constraints, and its evaluation."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
-import hydra
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import require_settings
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
-from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
+from cnfp_torchrl.training.agent import (
+    application_order,
+    build_actor,
+    build_environment,
+    build_loss,
+)
+from cnfp_torchrl.training.callbacks import (
+    RECORDING,
+    CallbackFactory,
+    EpisodeRecorder,
+    NoCallback,
+    TrainingCallback,
+    first_episodes,
+)
 from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import (
-    EvaluationSettings,
-    TrainingSettings,
-    require_frames,
-    require_settings,
-)
+from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings, require_frames
 from cnfp_torchrl.training.storage import prepare_buffer
 from cnfp_torchrl.training.update import Update
-from cnfp_torchrl.training.watching import (
-    RECORDING,
-    EpisodeCollector,
-    TrainingWatcher,
-    Unwatched,
-    Watch,
-    first_episodes,
-)
-from cnfp_torchrl.whole_file import whole_file
 
 
 def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     """Train, evaluate and leave everything in the run's folder.
 
     Args:
-        config: as composed from ``conf/train.yaml``.
-        folder: an empty one.
+        config: configuration as composed from ``conf/train.yaml``.
+        folder: an empty run folder.
 
     Returns:
         The summary that is also written to ``summary.json``.
@@ -60,16 +56,17 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
 
 def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     started = time.perf_counter()
+    # Settings
     require_settings(config)
-    settings: TrainingSettings = instantiate(config.training)
-    judgment: EvaluationSettings = instantiate(config.evaluation)
     require_frames(config)
-    score = instantiate(config.env.get("score"))
-    watch: Watch | None = instantiate(config.visual, _convert_="all") or None
+    settings: TrainingSettings = instantiate(config.training)
+    evaluation: EvaluationSettings = instantiate(config.evaluation)
+    score: LinearScore | None = instantiate(config.env.get("score"))
+    visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.threads)
 
-    # Environment and agent
+    # Environment, actor and loss
     env = build_environment(config, with_penalty=True)
     env.set_seed(config.seed)
     actor = build_actor(config, env)
@@ -78,7 +75,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
     update = Update(loss, optimizer, target, compiled=config.compile)
 
-    # Data
+    # Collector and replay buffer
     policy = WarmUpPolicy(actor, settings.warmup_frames)
     if config.compile:
         # Not the policy around it, which counts: a number that changes would be compiled anew.
@@ -87,7 +84,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     # A collector tries its policy once when it is made, which is not a step of the warm-up.
     policy.frames_left = settings.warmup_frames
     buffer = instantiate(config.replay_buffer)
-    kept = prepare_buffer(
+    stored = prepare_buffer(
         buffer,
         env,
         actor.in_keys,
@@ -95,32 +92,33 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         constraint_bytes=settings.constraint_bytes,
     )
 
-    watcher: TrainingWatcher = Unwatched()
-    if watch is not None:
-        watcher = watch.of_training(folder.path / RECORDING, actor, env)
+    # Callback and loggers
+    callback: TrainingCallback = NoCallback()
+    if visual is not None:
+        callback = visual.for_training(folder.path / RECORDING, actor, env)
     folder.save_config(config)
     loggers = [
         make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()
     ]
     metrics = Metrics(
-        [*loggers, *watcher.loggers],
+        [*loggers, *callback.loggers],
         counted_constraints(env),
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
 
-    owed = 0.0
-    with closing(watcher):
+    updates_due = 0.0
+    with closing(callback):
         for collected in collector:
-            watcher.see(collected)
+            callback.on_batch(collected)
             batch = collected.reshape(-1)
             metrics.add_steps(batch)
-            buffer.extend(batch.select(*kept))
+            buffer.extend(batch.select(*stored))
             if metrics.frames >= settings.warmup_frames:
-                owed += batch.numel() * settings.update_ratio
-                while owed >= 1:
+                updates_due += batch.numel() * settings.update_ratio
+                while updates_due >= 1:
                     metrics.add_losses(update(buffer.sample()))
-                    owed -= 1
+                    updates_due -= 1
             metrics.log_if_due()
         metrics.finish()
         collector.shutdown()
@@ -128,23 +126,22 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
 
         # Evaluation
-        watched: dict[bool, EpisodeCollector] = {}
-        if watch is not None:
-            watched[watch.deterministic] = EpisodeCollector(first_episodes(watch, judgment))
-        results = _evaluations(config, actor, judgment, watched)
+        recorders: dict[bool, EpisodeRecorder] = {}
+        if visual is not None:
+            recorders[visual.deterministic] = EpisodeRecorder(first_episodes(visual, evaluation))
         summary = {
-            **_results(metrics, results, score),
+            **_results(metrics, _evaluations(config, actor, evaluation, recorders), score),
             "steps": metrics.frames,
             "seconds": time.perf_counter() - started,
             "flow": type(flow_head(actor).flow).__name__,
-            "order": list(config.flow.order),
+            "order": application_order(config),
             "seed": config.seed,
         }
         folder.save_summary(summary)
-        # When the results are kept: a stream that fails takes nothing with it.
-        for shown in watched.values():
-            for episode in shown.episodes.values():
-                watcher.see_episode(episode)
+        # When the results are kept: a callback that fails takes nothing with it.
+        for recorder in recorders.values():
+            for episode in recorder.episodes.values():
+                callback.on_episode(episode)
     return summary
 
 
@@ -152,16 +149,23 @@ def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
     settings: EvaluationSettings,
-    watched: Mapping[bool, EpisodeCollector],
+    recorders: Mapping[bool, EpisodeRecorder],
 ) -> dict[str, Evaluation]:
-    """Evaluate the stochastic policy and the deterministic one; collect episodes of the watched."""
+    """Evaluate the stochastic policy and the deterministic one.
+
+    Args:
+        config: that of the run.
+        actor: the trained actor.
+        settings: number of episodes and the seed.
+        recorders: what keeps episodes, by whether the policy is deterministic.
+    """
     return {
         name: evaluate_seeded(
             build_environment(config, batch_size=[settings.episodes]),
             guarded(actor),
             settings,
             deterministic=deterministic,
-            see=watched.get(deterministic),
+            on_step=recorders.get(deterministic),
         )
         for name, deterministic in {"stochastic": False, "deterministic": True}.items()
     }
@@ -171,9 +175,9 @@ def _results(
     metrics: Metrics, evaluations: Mapping[str, Evaluation], score: LinearScore | None
 ) -> dict[str, Any]:
     """Return what the summary says of training and evaluations; violations are of them all."""
-    reports = {name: each.report(score) for name, each in evaluations.items()}
+    reports = {name: result.report(score) for name, result in evaluations.items()}
     violations = {
-        name: count + sum(each.violations[name] for each in evaluations.values())
+        name: count + sum(result.violations[name] for result in evaluations.values())
         for name, count in metrics.violations.items()
     }
     return {
@@ -183,39 +187,3 @@ def _results(
         "training_violations": metrics.violations,
         "evaluation": reports,
     }
-
-
-def _keep_what_was_asked(folder: RunFolder, config: DictConfig) -> None:
-    """Write what Hydra would, who would write it over that of a run whose folder it is."""
-    hydra_config = HydraConfig.get()
-    asked = {
-        "config": config,
-        "hydra": {"hydra": hydra_config},
-        "overrides": hydra_config.overrides.task,
-    }
-    place = folder.path / ".hydra"
-    place.mkdir(exist_ok=True)
-    for name, content in asked.items():
-        with whole_file(place / f"{name}.yaml") as file:
-            file.write(OmegaConf.to_yaml(content).encode())
-
-
-@hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
-def main(config: DictConfig) -> float | None:
-    """Run `train` for a Hydra configuration, draw its figures and print the summary."""
-    folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
-    _keep_what_was_asked(folder, config)
-    summary = train(config, folder)
-    if config.figures:
-        instantiate(config.figures)(folder)
-    violations = ", ".join(f"{name} {count}" for name, count in summary["violations"].items())
-    score = "" if summary["score"] is None else f", score {summary['score']:.3f}"
-    sys.stdout.write(
-        f"return {summary['return_mean']:.2f}{score}; violations: {violations or 'not counted'}; "
-        f"{summary['steps']} steps in {summary['seconds']:.0f} s\n{folder.path}\n"
-    )
-    return summary["score"]
-
-
-if __name__ == "__main__":
-    main()

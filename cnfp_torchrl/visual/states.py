@@ -7,9 +7,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
-from cnfp_torchrl.envs import find_task_view
 
 _DIRECTIONS = 256
 _VISIBLE = 0.15

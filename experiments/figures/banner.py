@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from torch import Tensor, nn
 
+from cnfp_torchrl.envs import Marks, TaskView, find_task_view
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.envs import Marks, TaskView, find_task_view
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import FlowSnapshot, Scene, Setting, take_snapshot
 from cnfp_torchrl.visual.colors import INK, MUTED

@@ -11,17 +11,16 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from cnfp_torchrl.modules import guarded
 from cnfp_torchrl.tasks.point_nav import Layout
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.evaluation import evaluate
+from cnfp_torchrl.training.evaluation import evaluate_seeded
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
-from experiments.paper.records import MODES, Outcome
+from experiments.paper.records import Evaluation, Outcome
 
 SECOND_RECTANGLE = (0.43, 0.43, 0.67, 0.67)
 """Away from the stations, across many of the ways between starts and goals."""
@@ -73,31 +72,28 @@ def changed(config: DictConfig, change: Callable[[Layout], Layout]) -> DictConfi
     return DictConfig(content)
 
 
-def evaluate_afterwards(folder: RunFolder) -> dict[str, dict[str, Outcome]]:
-    """Return what a run's policy does in each changed task, by change and mode.
+def evaluate_afterwards(folder: RunFolder) -> dict[str, Evaluation]:
+    """Return what a run's policy does in each changed task, by change.
 
     Args:
         folder: a finished run; its configuration says how many episodes, from which seed.
     """
     config = folder.load_config()
-    return {name: outcomes(folder, changed(config, change)) for name, change in CHANGES.items()}
+    return {name: evaluation(folder, changed(config, each)) for name, each in CHANGES.items()}
 
 
-def outcomes(folder: RunFolder, config: DictConfig) -> dict[str, Outcome]:
-    """Return what a run's policy does in the task of a configuration, by mode."""
+def evaluation(folder: RunFolder, config: DictConfig) -> Evaluation:
+    """Return what a run's policy does in the task of a configuration."""
     settings: EvaluationSettings = instantiate(config.evaluation)
     env = build_environment(config, batch_size=[settings.episodes])
     actor = guarded(load_actor(folder, config, env))
     score = instantiate(config.env.score)
-    results = {}
-    for mode in MODES:
-        env.set_seed(settings.seed)
-        torch.manual_seed(settings.seed)
-        result = evaluate(
-            env, actor, episodes=settings.episodes, deterministic=mode == "deterministic"
-        )
-        results[mode] = Outcome(**result.report(score))
-    return results
+
+    def outcome(deterministic: bool) -> Outcome:
+        result = evaluate_seeded(env, actor, settings, deterministic=deterministic)
+        return Outcome(**result.report(score))
+
+    return Evaluation(stochastic=outcome(False), deterministic=outcome(True))
 
 
 def _layouts(content: Any) -> Iterator[dict[str, Any]]:

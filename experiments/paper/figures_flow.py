@@ -1,45 +1,37 @@
 """The flow in three states: on the map, permissive and restrictive, from kept Gaussians.
 
 A network enters a picture of one state by nothing but the Gaussian that it puts there, so the few
-numbers of these are kept, and no checkpoint is needed to draw:
-
-    python -m experiments.paper.figures_flow RUN [--output experiments/paper/policy.json]
-
-reads them from the folder of a finished run of `experiment=exact`.
+numbers of these are kept, and no checkpoint is needed to draw.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, NamedTuple, Self
 
 import torch
 from matplotlib.figure import Figure
+from pydantic import Field, model_validator
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.visual import FlowSnapshot, explain, take_snapshot
 from cnfp_torchrl.visual.figures import flow_stages
 from experiments.figures.banner import flow_banner
-from experiments.paper.fields import Fields
+from experiments.paper.records import Kept, Text
 
-KEPT = Path(__file__).parent / "policy.json"
 ORDER = ["battery", "obstacle"]
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """A state of point navigation.
 
     Args:
@@ -64,22 +56,35 @@ In the first and the last the battery reaches a station and no farther, and the 
 """
 
 
-@dataclass(frozen=True)
-class KeptPolicy:
+class Gaussian(Kept):
+    """What a network puts into one state: location and scale, of two components each."""
+
+    loc: tuple[float, float]
+    scale: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+
+
+class KeptPolicy(Kept):
     """The Gaussians that a network puts into `PLACES`.
 
     Args:
         source: where they come from, in words.
-        gaussians: location and scale by the name of the place, ``(2,)`` each.
+        gaussians: one for each place, by its name.
     """
 
-    source: str
-    gaussians: dict[str, tuple[tuple[float, ...], tuple[float, ...]]]
+    source: Text
+    gaussians: dict[str, Gaussian]
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if sorted(self.gaussians) != sorted(PLACES):
+            given = sorted(self.gaussians)
+            raise ValueError(f"gaussians: expected {sorted(PLACES)}, given {given}")
+        return self
 
 
 UNTRAINED = KeptPolicy(
-    "a standard normal, in place of a network: no trained policy is kept",
-    dict.fromkeys(PLACES, ((0.0, 0.0), (1.0, 1.0))),
+    source="a standard normal, in place of a network: no trained policy is kept",
+    gaussians=dict.fromkeys(PLACES, Gaussian(loc=(0.0, 0.0), scale=(1.0, 1.0))),
 )
 
 
@@ -106,40 +111,19 @@ def find_policy(path: Path, runs: Path) -> KeptPolicy:
 
     Args:
         path: of the kept policy.
-        runs: folder of runs, ``exact/seed_S`` among them.
+        runs: folder of runs; those of ``experiment=exact`` are in its folder ``exact``.
 
     Raises:
         ValueError: when what is there cannot be used, naming it.
         OSError: when it cannot be read.
     """
     if path.is_file():
-        return load_policy(path)
-    for summary in sorted(runs.glob(f"exact/*/{SUMMARY}")):
+        return KeptPolicy.read(path)
+    for summary in sorted((runs / "exact").rglob(SUMMARY)):
         policy = policy_of(RunFolder.open(summary.parent))
-        save_policy(policy, path)
+        path.write_text(policy.model_dump_json(indent=1) + "\n", encoding="utf-8")
         return policy
     return UNTRAINED
-
-
-def load_policy(path: Path) -> KeptPolicy:
-    """Read a kept policy.
-
-    Raises:
-        RecordError: when the file is not a kept policy of these places, naming the field.
-    """
-    fields = Fields.read(path)
-    source, parts = fields.text("source"), fields.parts("gaussians")
-    if sorted(parts) != sorted(PLACES):
-        raise fields.error("gaussians", f"expected {sorted(PLACES)}, given {sorted(parts)}")
-    fields.nothing_left()
-    gaussians = {}
-    for name, part in parts.items():
-        loc, scale = part.numbers("loc"), part.numbers("scale")
-        if len(loc) != 2 or len(scale) != 2 or min(scale) <= 0:
-            raise part.error("loc, scale", f"expected 2 and 2 > 0 numbers, given {loc}, {scale}")
-        part.nothing_left()
-        gaussians[name] = (tuple(loc), tuple(scale))
-    return KeptPolicy(source, gaussians)
 
 
 @torch.no_grad()
@@ -161,22 +145,13 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
     gaussians = {}
     for name, place in PLACES.items():
         state = actor(_reset(env, place))
-        loc, scale = state.get("loc"), state.get("scale")
-        gaussians[name] = (tuple(loc.tolist()), tuple(scale.tolist()))
+        loc, scale = (tuple(state.get(key).tolist()) for key in ("loc", "scale"))
+        gaussians[name] = Gaussian(loc=loc, scale=scale)
     source = (
         f"the network of the exact flow, seed {config.seed}, after "
         f"{folder.load_settings()['collector']['total_frames']:,} training steps"
     )
-    return KeptPolicy(source, gaussians)
-
-
-def save_policy(policy: KeptPolicy, path: Path) -> None:
-    """Write a kept policy."""
-    gaussians = {
-        name: {"loc": loc, "scale": scale} for name, (loc, scale) in policy.gaussians.items()
-    }
-    text = json.dumps({"source": policy.source, "gaussians": gaussians}, indent=1)
-    path.write_text(text + "\n", encoding="utf-8")
+    return KeptPolicy(source=source, gaussians=gaussians)
 
 
 def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
@@ -201,9 +176,9 @@ def snapshot(policy: KeptPolicy, name: str) -> FlowSnapshot:
         order=ORDER,
         with_anchor=True,
     )
-    loc, scale = (torch.tensor(each) for each in policy.gaussians[name])
+    kept = policy.gaussians[name]
     actor: SafeProbabilisticTensorDictSequential = make_constrained_actor(
-        FixedGaussian(loc, scale), env
+        FixedGaussian(torch.tensor(kept.loc), torch.tensor(kept.scale)), env
     )
     return take_snapshot(actor, _reset(env, PLACES[name]))
 
@@ -216,20 +191,3 @@ def _title(kind: str, drawn: FlowSnapshot) -> str:
     share = explain(drawn).share_allowed
     assert share is not None
     return f"{kind} state: {100 * share:.0f} % of the actions are allowed"
-
-
-def main() -> None:
-    """Keep the Gaussians of a finished run."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run of experiment=exact")
-    parser.add_argument("--output", type=Path, default=KEPT, help="the JSON file to write")
-    arguments = parser.parse_args()
-    try:
-        policy = policy_of(RunFolder.open(arguments.run))
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
-    save_policy(policy, arguments.output)
-
-
-if __name__ == "__main__":
-    main()

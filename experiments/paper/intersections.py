@@ -16,7 +16,6 @@ from cnfp_torchrl.bijectors import Bijector, ExactSquash, SquashChain, paper_squ
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
 CASES, SAMPLES = 400, 2000
-FLOWS = ("squash", "exact")
 
 
 @dataclass(frozen=True)
@@ -77,10 +76,10 @@ def _try(region: Region, chosen: Tensor, judged: Sequence[int]) -> Tried:
         "exact": ExactSquash(region),
     }
     outside, broken = {}, {}
-    for flow in FLOWS:
+    for flow, bijector in bijectors.items():
         generator = torch.Generator().manual_seed(1)
         noise = torch.randn(SAMPLES, CASES, 2, generator=generator)
-        actions, _ = bijectors[flow].forward_and_log_det(noise)
+        actions, _ = bijector.forward_and_log_det(noise)
         left = torch.stack([~region.sets[k].contains(actions) for k in judged]).any(0)[:, chosen]
         outside[flow] = float(left.double().mean())
         broken[flow] = int(left.any(0).sum())

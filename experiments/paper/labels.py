@@ -1,22 +1,9 @@
-"""What methods are called, what they are, and how they look, in every figure and table."""
+"""What methods are called and how they look, in every figure and table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import Enum
-
-from cnfp_torchrl.visual.comparison import Look
-
-
-class Kind(Enum):
-    """What a method does about the constraints."""
-
-    EXACT = "exact by construction"
-    CHAIN = "the paper's chain"
-    PROJECTED = "projected"
-    LEARNED = "learned"
-    IGNORED = "ignored"
 
 
 @dataclass(frozen=True)
@@ -24,31 +11,31 @@ class Label:
     """A method as readers meet it.
 
     Args:
-        look: name, color and marker.
-        kind: what it does about the constraints.
+        name: for readers.
+        color: as ``#RRGGBB``.
+        marker: of matplotlib; tells methods apart where colors do not.
+        baseline: whether it cares about the constraints in another way than the exact flow.
     """
 
-    look: Look
-    kind: Kind
+    name: str
+    color: str
+    marker: str
+    baseline: bool = False
 
 
 # Colors of Okabe and Ito and grays of purple for the exact flow's two entropies; markers differ
 # too, so that no method is told by its color alone.
 LABELS = {
-    "exact": Label(Look("exact flow (ours)", "#4B2E83", "D"), Kind.EXACT),
-    "exact_action_entropy": Label(
-        Look("exact flow, entropy of the action", "#9B84CC", "d"), Kind.EXACT
-    ),
-    "gauge": Label(Look("exact flow, boxes radial too", "#2C5985", "h"), Kind.EXACT),
-    "radial": Label(Look("radial flow", "#56B4E9", "p"), Kind.EXACT),
-    "squash": Label(Look("chain of squashes (the paper's)", "#CC79A7", "s"), Kind.CHAIN),
-    "projection": Label(Look("projection", "#009E73", "^"), Kind.PROJECTED),
-    "lagrangian": Label(Look("SAC-Lagrangian", "#E69F00", "o"), Kind.LEARNED),
-    "lagrangian_threshold": Label(
-        Look("SAC-Lagrangian, small threshold", "#B2182B", "<"), Kind.LEARNED
-    ),
-    "penalty": Label(Look("reward penalty", "#8C510A", "v"), Kind.LEARNED),
-    "unconstrained": Label(Look("unconstrained", "#6E6E6E", "X"), Kind.IGNORED),
+    "exact": Label("exact flow (ours)", "#4B2E83", "D"),
+    "exact_action_entropy": Label("exact flow, entropy of the action", "#9B84CC", "d"),
+    "gauge": Label("exact flow, boxes radial too", "#2C5985", "h"),
+    "radial": Label("radial flow", "#56B4E9", "p"),
+    "squash": Label("chain of squashes (the paper's)", "#CC79A7", "s", baseline=True),
+    "projection": Label("projection", "#009E73", "^", baseline=True),
+    "lagrangian": Label("SAC-Lagrangian", "#E69F00", "o", baseline=True),
+    "lagrangian_threshold": Label("SAC-Lagrangian, small threshold", "#B2182B", "<", baseline=True),
+    "penalty": Label("reward penalty", "#8C510A", "v", baseline=True),
+    "unconstrained": Label("unconstrained", "#6E6E6E", "X"),
 }
 """In the order in which they are shown."""
 
@@ -62,10 +49,9 @@ def label(method: str) -> Label:
     family = max((name for name in LABELS if method.startswith(f"{name}_")), key=len, default=None)
     color, marker = _SPARE[sum(method.encode()) % len(_SPARE)]
     if family is None:
-        return Label(Look(method, color, marker), Kind.LEARNED)
+        return Label(method, color, marker, baseline=True)
     rest = method.removeprefix(f"{family}_").replace("_", " ")
-    known = LABELS[family]
-    return Label(Look(f"{known.look.label}, {rest}", color, marker), known.kind)
+    return Label(f"{LABELS[family].name}, {rest}", color, marker, LABELS[family].baseline)
 
 
 def in_order(methods: Iterable[str]) -> list[str]:

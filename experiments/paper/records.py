@@ -1,77 +1,271 @@
-"""A folder of records: what can be compared, and what is wrong with the rest."""
+"""One small file for each run: what was run, on what, and what came out of it.
+
+A record stands at ``FOLDER/METHOD/seed_S.json``. Reading is strict: whatever is missing, cut,
+foreign, not finite or inconsistent is an error that names the file and the field.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
-from experiments.paper.fields import RecordError
-from experiments.paper.record import (
-    MODES,
-    PROCESSOR,
-    RETURN,
-    SECONDS,
-    VIOLATIONS,
-    Outcome,
-    Record,
-    Series,
-    load_record,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-__all__ = [
-    "MODES",
-    "PROCESSOR",
-    "RETURN",
-    "SECONDS",
-    "VIOLATIONS",
-    "Outcome",
-    "Record",
-    "RecordError",
-    "Series",
-    "load_record",
-    "load_records",
-]
+from cnfp_torchrl.whole_file import whole_file
+
+RETURN, PROCESSOR, VIOLATIONS = "train/return", "train/processor_seconds", "violations/"
+"""Names of curves; the last is followed by the constraint's."""
+
+Count = Annotated[int, Field(ge=0)]
+Text = Annotated[str, Field(min_length=1)]
 
 
-def load_records(
-    folder: Path, expected: Iterable[tuple[str, int]] = ()
-) -> tuple[list[Record], list[str]]:
+class RecordError(ValueError):
+    """A file is not what it should be."""
+
+
+class Kept(BaseModel):
+    """Values kept as a JSON file, read strictly: exact types, finite numbers, no further fields."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            RecordError: naming the file, every bad field, what was expected and what was given.
+        """
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except ValidationError as error:
+            raise RecordError(f"{path}: {'; '.join(map(_in_words, error.errors()))}") from None
+        except OSError as error:
+            raise RecordError(f"{path}: {error.strerror}") from None
+
+
+class Series(Kept):
+    """A scalar over training.
+
+    Args:
+        steps: environment steps since the start, strictly rising.
+        values: one for each of the steps.
+    """
+
+    steps: Annotated[tuple[Count, ...], Field(min_length=1)]
+    values: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if len(self.steps) != len(self.values):
+            given = f"{len(self.values)} values and {len(self.steps)} steps"
+            raise ValueError(f"expected as many values as steps, given {given}")
+        if any(a >= b for a, b in itertools.pairwise(self.steps)):
+            raise ValueError("expected steps that rise")
+        return self
+
+
+class Outcome(Kept):
+    """What a policy did in whole episodes.
+
+    Args:
+        return_mean: mean undiscounted return of an episode.
+        return_standard_error: of that mean.
+        score: the mean return on the task's scale.
+        violations: violating steps by constraint, all episodes together.
+        episodes: number of episodes.
+        steps: environment steps, all episodes together.
+    """
+
+    return_mean: float
+    return_standard_error: float
+    score: float
+    violations: dict[str, Count]
+    episodes: Count
+    steps: Count
+
+
+class Evaluation(Kept):
+    """What a trained policy did with drawn actions, and with the mode of its distribution."""
+
+    stochastic: Outcome
+    deterministic: Outcome
+
+    @property
+    def both(self) -> tuple[Outcome, Outcome]:
+        """Both outcomes."""
+        return self.stochastic, self.deterministic
+
+
+class Record(Kept):
+    """One finished run.
+
+    Args:
+        format: what kind of file this is.
+        version: of that format.
+        method: name of its experiment, a file of ``conf/experiment``.
+        seed: of everything random.
+        overrides: what was given to the trainer beside experiment and seed.
+        config: the training configuration, every interpolation resolved.
+        versions: of Python and of the packages that decide the numbers.
+        commit: of the repository, None where it is not known.
+        steps: environment steps of training.
+        seconds: wall time of training and evaluation; runs beside it slow it down.
+        curves: logged scalars by name: return, cumulative violations of each constraint, processor
+            seconds, and whatever else the method logs.
+        training_violations: violating steps by constraint while training.
+        evaluation: of the trained policy.
+        afterwards: the same policy after a change of the task that it was not trained for, by the
+            change's name; empty where that was not evaluated.
+    """
+
+    format: Literal["cnfp_torchrl paper record"] = "cnfp_torchrl paper record"
+    version: Literal[1] = 1
+    method: Text
+    seed: Count
+    overrides: tuple[Text, ...]
+    config: dict[str, Any]
+    versions: dict[str, str]
+    commit: str | None
+    steps: Count
+    seconds: float
+    curves: dict[str, Series]
+    training_violations: dict[str, Count]
+    evaluation: Evaluation
+    afterwards: dict[str, Evaluation]
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Names of the constraints, in the order of the costs."""
+        return tuple(self.training_violations)
+
+    @property
+    def violations(self) -> int:
+        """Violating steps in training and both evaluations, all constraints together."""
+        counts = [self.training_violations, *(each.violations for each in self.evaluation.both)]
+        return sum(sum(each.values()) for each in counts)
+
+    def save(self, folder: Path) -> Path:
+        """Write the record into a folder of records, complete or not at all, and return its path.
+
+        Raises:
+            FileExistsError: when something stands there already.
+        """
+        path = record_path(folder, self.method, self.seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path, exclusive=True) as file:
+            file.write(f"{self.model_dump_json()}\n".encode())
+        return path
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        """Refuse what contradicts itself."""
+        if (given := self.config.get("seed")) != self.seed:
+            raise ValueError(f"config.seed: expected {self.seed} as in 'seed', given {given!r}")
+        needed = [RETURN, PROCESSOR, *(VIOLATIONS + name for name in self.constraints)]
+        if missing := [name for name in needed if name not in self.curves]:
+            raise ValueError(f"curves: expected {needed}, but {missing} are missing")
+        for name, series in self.curves.items():
+            if (last := series.steps[-1]) > self.steps:
+                raise ValueError(
+                    f"curves.{name}.steps: expected at most {self.steps}, given {last}"
+                )
+        for name, count in self.training_violations.items():
+            values = self.curves[VIOLATIONS + name].values
+            if any(a > b for a, b in itertools.pairwise(values)) or values[-1] != count:
+                raise ValueError(
+                    f"curves.{VIOLATIONS}{name}.values: expected counts that never fall and end at "
+                    f"{count}, given {values[-1]} last"
+                )
+        for name, evaluation in {"evaluation": self.evaluation, **self.afterwards}.items():
+            for outcome in evaluation.both:
+                if (found := tuple(outcome.violations)) != self.constraints:
+                    raise ValueError(
+                        f"{name}: violations: expected the constraints {list(self.constraints)}, "
+                        f"given {list(found)}"
+                    )
+        return self
+
+
+class HostileRun(Kept):
+    """One hostile network behind one flow.
+
+    Args:
+        flow: name of the flow's configuration.
+        network: name of the network.
+        steps: environment steps.
+        violations: violating steps by constraint.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    flow: Text
+    network: Text
+    steps: Count
+    violations: dict[str, Count]
+
+
+class HostileRuns(Kept):
+    """What ``experiments/hostile_networks.py`` keeps, as far as the report shows it."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    rows: Annotated[tuple[HostileRun, ...], Field(min_length=1)]
+
+    def by_flow(self) -> dict[str, list[HostileRun]]:
+        """Return the runs of each flow, in the order in which flows first appear."""
+        return {
+            flow: [r for r in self.rows if r.flow == flow] for flow in (r.flow for r in self.rows)
+        }
+
+
+def record_path(folder: Path, method: str, seed: int) -> Path:
+    """Return where the record of a run stands in a folder of records."""
+    return folder / method / f"seed_{seed}.json"
+
+
+def load_records(folder: Path) -> tuple[list[Record], list[str]]:
     """Read a folder of records; what is wrong is named and left out, never averaged.
 
     Runs of one method are comparable when only their seeds differ: of several configurations the
     most frequent is kept. A seed that one method has and another lacks is named too.
 
-    Args:
-        folder: of ``METHOD/seed_S.json`` files.
-        expected: methods and seeds that should be there besides.
-
     Returns:
         the usable records by method and seed, and a sentence for each problem.
     """
     found, problems = [], []
-    for path in sorted(folder.rglob("*") if folder.is_dir() else ()):
-        if path.is_dir():
-            continue
+    for path in sorted(path for path in folder.rglob("*") if not path.is_dir()):
         try:
-            record = load_record(path)
+            record = Record.read(path)
         except RecordError as error:
             problems.append(f"{error} (left out)")
             continue
-        if record.path(folder) == path:
+        if record_path(folder, record.method, record.seed) == path:
             found.append(record)
         else:
             problems.append(
-                f"{path}: method, seed: expected a record of the run that the path names, given "
+                f"{path}: expected a record of the run that the path names, given "
                 f"{record.method!r}, seed {record.seed}: a copy or a misplaced file (left out)"
             )
-    records, mixed = _alike(sorted(found, key=lambda r: (r.method, r.seed)))
-    problems += mixed
+    records = []
+    for method, runs in by_method(sorted(found, key=lambda r: (r.method, r.seed))).items():
+        settings = [json.dumps([r.steps, without_seed(r)], sort_keys=True) for r in runs]
+        usual = Counter(settings).most_common(1)[0][0]
+        for record, given in zip(runs, settings, strict=True):
+            if given == usual:
+                records.append(record)
+            else:
+                problems.append(
+                    f"{method}, seed {record.seed}: config: expected that of the method's other "
+                    f"runs, given another with {record.steps:,} steps (left out)"
+                )
     present = {(record.method, record.seed) for record in found}
-    seeds = {record.seed for record in records}
-    wanted = {(r.method, seed) for r in found for seed in seeds} | set(expected)
-    problems += [f"{method}, seed {seed}: no record" for method, seed in sorted(wanted - present)]
+    wanted = itertools.product(by_method(found), {record.seed for record in records})
+    problems += [f"{m}, seed {seed}: no record" for m, seed in sorted({*wanted} - present)]
     budgets = {record.method: record.steps for record in records}
     if len(set(budgets.values())) > 1:
         given = ", ".join(f"{method} {steps:,}" for method, steps in budgets.items())
@@ -79,24 +273,45 @@ def load_records(
     return records, problems
 
 
-def _alike(records: list[Record]) -> tuple[list[Record], list[str]]:
-    settings = {id(record): _settings(record) for record in records}
-    counts: dict[str, Counter[str]] = {}
+def by_method(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Return the records of each method, in the order in which methods first appear."""
+    grouped: dict[str, list[Record]] = {}
     for record in records:
-        counts.setdefault(record.method, Counter())[settings[id(record)]] += 1
-    usual = {method: counter.most_common(1)[0][0] for method, counter in counts.items()}
-    kept = [record for record in records if settings[id(record)] == usual[record.method]]
-    problems = [
-        f"{record.method}, seed {record.seed}: config: expected that of the method's other runs, "
-        f"given another with {record.steps:,} steps and overrides {list(record.overrides)} "
-        "(left out)"
-        for record in records
-        if settings[id(record)] != usual[record.method]
-    ]
-    return kept, problems
+        grouped.setdefault(record.method, []).append(record)
+    return grouped
 
 
-def _settings(record: Record) -> str:
-    """Return what must agree between runs whose results are averaged."""
-    config = {name: each for name, each in record.config.items() if name != "seed"}
-    return json.dumps([record.steps, config], sort_keys=True)
+def without_seed(record: Record) -> dict[str, Any]:
+    """Return what a run's configuration shares with those of other seeds."""
+    return {name: value for name, value in record.config.items() if name != "seed"}
+
+
+def differences(
+    one: Mapping[str, Any], other: Mapping[str, Any]
+) -> dict[str, tuple[str | None, str | None]]:
+    """Return the settings in which two configurations differ, by dotted name, in both as JSON.
+
+    None stands for a setting that is absent.
+    """
+    first, second = dict(_flat(one)), dict(_flat(other))
+    names = sorted({*first, *second})
+    pairs = {name: (first.get(name), second.get(name)) for name in names}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _flat(content: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    if not isinstance(content, Mapping) or not content:
+        yield prefix, json.dumps(content)
+        return
+    for name, each in content.items():
+        yield from _flat(each, f"{prefix}.{name}" if prefix else name)
+
+
+def _in_words(error: Any) -> str:
+    """Return one of pydantic's errors as a sentence that names the field."""
+    message = error["msg"].removeprefix("Value error, ")
+    field = ".".join(map(str, error["loc"]))
+    if error["type"] not in ("value_error", "missing", "json_invalid"):
+        shown = repr(error["input"])
+        message += f", given {shown if len(shown) <= 80 else shown[:77] + '...'}"
+    return f"{field}: {message}" if field else message

@@ -1,41 +1,57 @@
-"""Figures and report from kept records: ``python -m experiments.paper.report``.
+"""Figures and pages from kept records: ``python -m experiments.paper.report [FOLDER]``.
 
-Draws ``images/*.png`` and writes ``README.md`` beside them. The same data give the same bytes.
+Draws ``images/*.png`` from ``data/``, and writes ``README.md`` and ``details.md`` beside them. The
+same data give the same bytes.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.paper.claims import AIMS, BASELINE_CLAIMS, FLOW_CLAIMS, Claim
-from experiments.paper.fields import RecordError
-from experiments.paper.figures import FIGURES, draw_figures
-from experiments.paper.figures_flow import UNTRAINED, KeptPolicy, find_policy
-from experiments.paper.hostile import KEPT as KEPT_HOSTILE
-from experiments.paper.hostile import HostileRun, load_hostile
-from experiments.paper.intersections import FLOWS
-from experiments.paper.judgments import Evidence
+from matplotlib.figure import Figure
+
+from cnfp_torchrl.visual.figures.canvas import save_png
+from experiments.paper.claims import (
+    AIMS,
+    BASELINE_CLAIMS,
+    FLOW_CLAIMS,
+    FLOWS,
+    Claim,
+    Evidence,
+    Finding,
+    Verdict,
+)
+from experiments.paper.figures_flow import UNTRAINED, KeptPolicy, find_policy, flow_figures
+from experiments.paper.figures_mappings import draw_mappings
+from experiments.paper.figures_methods import (
+    draw_afterwards,
+    draw_hostile,
+    draw_summary,
+    draw_trade_off,
+    draw_training,
+    draw_violation_rates,
+)
 from experiments.paper.labels import in_order, label
-from experiments.paper.records import Record, load_records
-from experiments.paper.report_tables import (
+from experiments.paper.records import HostileRuns, RecordError, by_method, load_records
+from experiments.paper.statistics import TARGET_SCORE
+from experiments.paper.tables import (
     afterwards_table,
+    configurations_table,
     hostile_table,
     methods_table,
     provenance,
+    speed_table,
     table,
     violations_table,
 )
-from experiments.paper.statistics import by_method
-from experiments.paper.verdicts import Verdict
 
 HERE = Path(__file__).parent
-DATA, RUNS, IMAGES, REPORT, POLICY = "data", "runs", "images", "README.md", "policy.json"
+HOSTILE = HERE.parent / "results" / "hostile_networks.json"
 
-_SHORT = {"squash": "chain", "exact": "exact"}
 AIM_WORDS = {
     Verdict.YES: "met",
     Verdict.PARTLY: "partly",
@@ -49,162 +65,274 @@ class Gathered:
     """Everything that the report is made of.
 
     Args:
-        records: those that can be used, one or more.
+        evidence: the records that can be used, one or more, and what hostile networks did.
         problems: a sentence for whatever cannot.
-        hostile: what hostile networks did.
         policy: whose flow is drawn.
     """
 
-    records: list[Record]
-    problems: list[str]
-    hostile: list[HostileRun]
+    evidence: Evidence
+    problems: Sequence[str]
     policy: KeptPolicy
 
 
-def write_report(data: Path, output: Path) -> Path:
-    """Draw the figures and write the report, and return where it is.
+@dataclass(frozen=True)
+class Judged:
+    """A claim and what was found.
 
     Args:
-        data: folder of records.
-        output: folder for ``README.md`` and ``images/``. The pictures of the flow take their
-            Gaussians from its ``policy.json``, or from a finished run in its ``runs/``.
+        kind: "Claim" of the paper, or "Aim" of this project.
+        number: of all claims and aims.
+        claim: what is claimed.
+        found: by flow.
+    """
+
+    kind: str
+    number: int
+    claim: Claim
+    found: Mapping[str, Finding]
+
+    def verdict(self, flow: str) -> str:
+        """Return the verdict about a flow in words, bold where the claim holds."""
+        verdict = self.found[flow].verdict
+        word = AIM_WORDS[verdict] if self.kind == "Aim" else verdict.value
+        return f"**{word}**" if verdict is Verdict.YES else word
+
+
+def write_report(folder: Path) -> Path:
+    """Draw the figures and write the pages, and return where the first is.
+
+    Args:
+        folder: with records in ``data/``. The pictures of the flow take their Gaussians from its
+            ``policy.json``, or from a finished run in its ``runs/``.
 
     Raises:
         RecordError: when there is no usable record at all, naming what is wrong.
     """
-    gathered = gather(data, output)
-    draw_figures(gathered.records, gathered.hostile, gathered.policy, output / IMAGES)
-    path = output / REPORT
-    path.write_text(compose(gathered), encoding="utf-8")
-    return path
+    gathered = gather(folder)
+    for name, figure in draw_figures(gathered).items():
+        save_png(figure, folder / "images" / f"{name}.png", dpi=96)
+    for name, page in pages(gathered).items():
+        (folder / name).write_text(page, encoding="utf-8")
+    return folder / "README.md"
 
 
-def gather(data: Path, output: Path, *, hostile: Path = KEPT_HOSTILE) -> Gathered:
+def gather(folder: Path, *, hostile: Path = HOSTILE) -> Gathered:
     """Read everything, and name what cannot be used.
 
     Args:
-        data: see `write_report`.
-        output: see `write_report`.
+        folder: see `write_report`.
         hostile: the kept result of ``experiments/hostile_networks.py``.
 
     Raises:
         RecordError: see `write_report`.
     """
+    data = folder / "data"
     records, problems = load_records(data)
     if not records:
         reasons = "\n".join(problems) or "the folder is empty or missing"
         raise RecordError(f"{data}: expected a record or more, METHOD/seed_S.json, but {reasons}")
-    tried, policy = list[HostileRun](), UNTRAINED
+    flows, policy = {}, UNTRAINED
     try:
-        tried = load_hostile(hostile)
+        flows = HostileRuns.read(hostile).by_flow()
     except RecordError as error:
         problems.append(f"{error} (left out)")
     try:
-        policy = find_policy(output / POLICY, output / RUNS)
+        policy = find_policy(folder / "policy.json", folder / "runs")
     except (OSError, ValueError) as error:
         problems.append(f"{error} (the flow is drawn with {UNTRAINED.source})")
     # Where these folders stand on this machine is nothing to readers.
-    for folder in (data, output, hostile.parent):
-        problems = [each.replace(f"{folder}/", "") for each in problems]
-    return Gathered(records, problems, tried, policy)
+    for each in (data, folder, hostile.parent):
+        problems = [problem.replace(f"{each}/", "") for problem in problems]
+    runs = by_method(records)
+    return Gathered(
+        Evidence({name: runs[name] for name in in_order(runs)}, flows), problems, policy
+    )
 
 
-def compose(gathered: Gathered) -> str:
-    """Return the report's text."""
-    runs = by_method(gathered.records)
-    evidence = Evidence({name: runs[name] for name in in_order(runs)}, gathered.hostile)
-    source, problems = gathered.policy.source, gathered.problems
-    captions = {name: text.format(source=source) for name, (_, text) in FIGURES.items()}
-    parts = [
-        "# The paper's experiment, repeated",
-        "Constrained 2D point navigation (Rietz et al. 2024, arXiv 2405.01198), with the methods "
-        "of the paper, the exact flow of this library and a projection. A command writes this page "
-        "from the records in `data/`, every verdict by a rule that stands below; no number and no "
-        "verdict is written by hand. Values are interquartile means over seeds, "
-        "in brackets their 95 % bootstrap intervals.",
-        _warning(problems),
-        "## At a glance",
-        _image("trade_off", captions),
-        methods_table(evidence.runs),
-        "Score 0 is standing still, 1 a heuristic planner projected into the sets; 400 episodes "
-        "after training. Area: mean score while training. Steps and processor seconds: until the "
-        "training score first was 0.75; where a run never was, how many were.",
-        violations_table(evidence.runs),
-        "## The paper's claims",
-        "About its flow, judged for the paper's own chain of squashes and for the exact flow:",
-        _flow_claims(evidence),
-        "About the other methods:",
-        _claims(BASELINE_CLAIMS, evidence, {each: each.value for each in Verdict}),
-        "### The rules",
-        _rules(),
-        "## What the exact flow has to reach",
-        _claims(
-            AIMS, evidence, AIM_WORDS, kind="aim", first=1 + len(FLOW_CLAIMS) + len(BASELINE_CLAIMS)
-        ),
-        "## Training",
-        _image("training", captions),
-        _image("violations_per_episode", captions),
-        "## Interquartile means and intervals",
-        _image("summary", captions),
-        "## A constraint switched on after training",
-        _image("afterwards", captions),
-        afterwards_table(evidence.runs),
-        "## Hostile networks",
-        _image("hostile", captions) if gathered.hostile else "",
-        hostile_table(gathered.hostile),
-        "## The flow, stage by stage",
-        *(_image(name, captions) for name in ("flow", "permissive", "restrictive", "mappings")),
-        "## What was left out",
-        "\n".join(f"- {each}" for each in problems) or "Nothing.",
-        "## How it was measured",
-        provenance(evidence.runs),
+def draw_figures(gathered: Gathered) -> dict[str, Figure]:
+    """Return every figure for which there is data, by name."""
+    runs, hostile = gathered.evidence.runs, gathered.evidence.hostile
+    return {
+        "trade_off": draw_trade_off(runs),
+        "training": draw_training(runs),
+        "violations_per_episode": draw_violation_rates(runs),
+        "summary": draw_summary(runs),
+        "afterwards": draw_afterwards(runs),
+        **({"hostile": draw_hostile(hostile)} if hostile else {}),
+        **flow_figures(gathered.policy),
+        "mappings": draw_mappings(),
+    }
+
+
+def pages(gathered: Gathered) -> dict[str, str]:
+    """Return the text of both pages by the names of their files."""
+    judged = list(judge(gathered.evidence))
+    return {
+        "README.md": "\n\n".join(_page(gathered, judged)) + "\n",
+        "details.md": "\n\n".join(_details(gathered, judged)) + "\n",
+    }
+
+
+def judge(evidence: Evidence) -> Iterator[Judged]:
+    """Yield every claim with what the evidence says of it, for each flow that it is about."""
+    for i, claim in enumerate((*FLOW_CLAIMS, *BASELINE_CLAIMS, *AIMS)):
+        flows = FLOWS if claim in FLOW_CLAIMS else ("exact",)
+        found = {flow: claim.judge(evidence, flow) for flow in flows}
+        yield Judged("Aim" if claim in AIMS else "Claim", 1 + i, claim, found)
+
+
+def _page(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
+    evidence, problems = gathered.evidence, gathered.problems
+    runs, source = evidence.runs, gathered.policy.source
+    every = [run for records in runs.values() for run in records]
+    episodes = _values(run.evaluation.stochastic.episodes for run in every)
+    yield "# The paper's experiment, repeated"
+    yield (
+        "Constrained 2D point navigation ([Rietz et al. 2024](https://arxiv.org/abs/2405.01198)) "
+        "with the methods of the paper, the exact flow of this library and a projection: "
+        f"{len(every)} runs, of {_values(run.steps for run in every)} environment steps each. A "
+        "command writes this page from the records in `data/`, every "
+        "verdict by a [rule](details.md#claims-and-rules); no number and no verdict is written by "
+        "hand."
+    )
+    if problems:
+        count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
+        yield f"> **{count} with the data**: see [what was left out](details.md#what-was-left-out)."
+    yield "## The methods"
+    yield methods_table(runs)
+    yield (
+        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. Score 0 is "
+        f"standing still, 1 a heuristic planner projected into the sets; {episodes} episodes after "
+        f"training. Steps: until the score in training first was {TARGET_SCORE:g}; where some run "
+        "never was, how many were. Violating steps: of training and evaluations, all constraints "
+        "together. [All numbers](details.md#all-numbers)."
+    )
+    yield _image(
+        "trade_off",
+        "Score against violations for all methods",
+        "Each dot is a run, each mark a method. 0 violations stands on the axis.",
+    )
+    yield "## The paper's claims"
+    yield "The number of a claim leads to its rule and to what was measured."
+    about_flow, others = judged[: len(FLOW_CLAIMS)], judged[len(FLOW_CLAIMS) :]
+    heads = [label(flow).name for flow in FLOWS]
+    yield _claims(["about its flow", *heads], about_flow)
+    yield _claims(["about the other methods", "verdict"], [j for j in others if j.kind == "Claim"])
+    yield "What the exact flow has to reach beyond that:"
+    yield _claims(["aim", "verdict"], [each for each in others if each.kind == "Aim"])
+    yield "## Training"
+    yield _image(
+        "training",
+        "Return and cumulative violations over training",
+        "The paper's fourth figure. Methods that coincide at 0 are told by their markers.",
+    )
+    yield _image(
+        "violations_per_episode",
+        "Violating steps per episode over training",
+        "Each round of episodes, which all agents end together. Axes are linear below 0.1.",
+    )
+    yield _image(
+        "summary",
+        "Scores, areas, speed and violations with intervals",
+        "Faint dots are the runs. A method of which some run never reached the score has no mean "
+        "there.",
+    )
+    yield "## A constraint switched on after training"
+    yield _image(
+        "afterwards",
+        "Return and violations after a change of the constraints",
+        "Trained policies, stochastic, in the task as it was and in two changed ones, without "
+        "another step of training. [In numbers](details.md#after-a-change).",
+    )
+    yield "## Hostile networks"
+    if evidence.hostile:
+        yield _image(
+            "hostile",
+            "Violations of hostile networks behind each flow",
+            "Untrained networks and networks made to break constraints, with means up to a "
+            "million. [In numbers](details.md#behind-hostile-networks).",
+        )
+    yield "## The flow, stage by stage"
+    yield _image(
+        "flow",
+        "The flow on the map",
+        "The paper's first figure. The last caption counts among a million fresh samples.",
+    )
+    yield _image(
+        "permissive",
+        "The flow in a permissive state",
+        "The paper's third figure, top: nothing near, battery full.",
+    )
+    yield _image(
+        "restrictive",
+        "The flow in a restrictive state",
+        "The paper's third figure, bottom: at a wall, with two steps of battery left.",
+    )
+    yield f"The Gaussian in these three: {source}."
+    yield _image(
+        "mappings",
+        "Particles before and after each mapping",
+        "The paper's second figure: its squashes in the first row, then a retraction and the exact "
+        "flow into further sets, within the dashed action bounds; a shell has a squash of its own. "
+        "A particle keeps its color.",
+    )
+    yield "[How it was measured](details.md#how-it-was-measured), and how to repeat it."
+
+
+def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
+    evidence = gathered.evidence
+    runs = evidence.runs
+    yield "# Rules, measurements and provenance"
+    yield "Behind [the paper's experiment, repeated](README.md)."
+    yield "## Claims and rules"
+    for each in judged:
+        yield f"### {each.kind} {each.number}"
+        yield f"{each.claim.statement} *{each.claim.rule[0].upper()}{each.claim.rule[1:]}.*"
+        yield "\n".join(
+            (f"- {label(flow).name}: " if len(each.found) > 1 else "- ")
+            + f"{each.verdict(flow)}; {finding.measured}"
+            for flow, finding in each.found.items()
+        )
+    yield "## All numbers"
+    yield "Score and its speed are in [the first table](README.md#the-methods)."
+    yield "### Area and time"
+    yield "Area: mean score while training."
+    yield speed_table(runs)
+    yield "### Violations"
+    yield violations_table(runs)
+    yield "### After a change"
+    yield afterwards_table(runs)
+    yield "### Behind hostile networks"
+    yield hostile_table(evidence.hostile)
+    yield "Each network is in `experiments/results/hostile_networks.md`."
+    yield "## What was left out"
+    yield "\n".join(f"- {each}" for each in gathered.problems) or "Nothing."
+    yield "## How it was measured"
+    yield configurations_table(runs)
+    yield "Names of classes are those of the commits."
+    yield provenance(runs)
+
+
+def _claims(head: Sequence[str], judged: Sequence[Judged]) -> str:
+    rows = [
+        [
+            f"[{each.number}](details.md#{each.kind.lower()}-{each.number})",
+            each.claim.statement,
+            *map(each.verdict, each.found),
+        ]
+        for each in judged
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return table(["", *head], rows)
 
 
-def _warning(problems: Sequence[str]) -> str:
-    if not problems:
-        return ""
-    count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
-    return f"> **{count} with the data**: see [what was left out](#what-was-left-out)."
+def _values(numbers: Iterable[int]) -> str:
+    """Return the smallest and the largest of some numbers in words, once where they agree."""
+    ordered = sorted(numbers)
+    return " to ".join(f"{each:,}" for each in dict.fromkeys((ordered[0], ordered[-1])))
 
 
-def _rules() -> str:
-    rules = [each.rule for each in FLOW_CLAIMS]
-    rules += [each.rule for each in (*BASELINE_CLAIMS, *AIMS)]
-    return "\n".join(f"{i}. {each[0].upper()}{each[1:]}." for i, each in enumerate(rules, start=1))
-
-
-def _flow_claims(evidence: Evidence) -> str:
-    rows = []
-    for i, claim in enumerate(FLOW_CLAIMS, start=1):
-        found = {flow: claim.judge(evidence, flow) for flow in FLOWS}
-        said = [f"{_SHORT[flow]}: {each.measured}" for flow, each in found.items()]
-        if len({each.measured for each in found.values()}) == 1:
-            said = [found[FLOWS[0]].measured]
-        verdicts = [f"**{each.verdict.value}**" for each in found.values()]
-        rows.append([str(i), claim.statement, *verdicts, "<br>".join(said)])
-    heads = [label(flow).look.label for flow in FLOWS]
-    return table(["", "claim", *heads, "measured"], rows)
-
-
-def _claims(
-    claims: Sequence[Claim],
-    evidence: Evidence,
-    words: Mapping[Verdict, str],
-    *,
-    kind: str = "claim",
-    first: int = 1 + len(FLOW_CLAIMS),
-) -> str:
-    rows = []
-    for i, claim in enumerate(claims, start=first):
-        found = claim.judge(evidence)
-        rows.append([str(i), claim.statement, f"**{words[found.verdict]}**", found.measured])
-    return table(["", kind, "verdict", "measured"], rows)
-
-
-def _image(name: str, captions: Mapping[str, str]) -> str:
-    return f"![{FIGURES[name][0]}]({IMAGES}/{name}.png)\n\n*{captions[name]}*"
+def _image(name: str, title: str, caption: str) -> str:
+    return f"![{title}](images/{name}.png)\n\n*{caption}*"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -212,11 +340,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.paper.report", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--data", type=Path, default=HERE / DATA, help="folder of records")
-    parser.add_argument("--output", type=Path, default=HERE, help="folder of report and images")
-    options = parser.parse_args(arguments)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=HERE, help="with records in data/ (%(default)s)"
+    )
     try:
-        path = write_report(options.data, options.output)
+        path = write_report(parser.parse_args(arguments).folder)
     except RecordError as error:
         sys.stderr.write(f"error: {error}\n")
         return 1

@@ -1,198 +1,188 @@
-"""Run methods and seeds side by side, and keep a record of each: ``python -m experiments.paper``.
+"""Do the runs of the report, some side by side, and keep a record of each.
 
-Records go to ``DATA/METHOD/seed_S.json``, runs with their checkpoints and logs to
-``RUNS/METHOD/seed_S/``. What has a record already is not run again, so the same command goes on
-where it was stopped. Figures and report are drawn at the end from all records of the folder.
+    python -m experiments.paper.run [key=value ...]
+
+``sweep.yaml`` says which methods, seeds and budget, and where to; every key of ``conf/train.yaml``
+can be overridden. What has a record already is not run again, so the same command goes on where it
+was stopped. A run that fails does not hold up the others; the exit status tells.
 """
 
 from __future__ import annotations
 
-import argparse
-import fcntl
+import json
+import logging
 import os
+import platform
 import signal
-import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import subprocess
+from collections.abc import Mapping
+from contextlib import redirect_stderr
+from importlib.metadata import version
 from pathlib import Path
-from types import FrameType
+from typing import Any
 
-from experiments.paper.jobs import RunningJob, stop_all
-from experiments.paper.plan import Job, PlanError, known_methods, make_jobs, still_to_do
-from experiments.paper.progress import Progress, make_progress
-from experiments.paper.records import RecordError
+import hydra
+from filelock import FileLock
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
-OUTPUT = Path("outputs/paper")
-PAUSE = 0.5
-"""Seconds between two looks at the running processes."""
+from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
+from cnfp_torchrl.training.train import train
+from cnfp_torchrl.visual.figures import read_scalars
+from experiments.paper.afterwards import evaluate_afterwards
+from experiments.paper.records import Evaluation, Record, Series, differences, record_path
+
+PRESENTATION = ("figures", "hydra", "logger", "visual")
+"""Sections of the training configuration that change nothing in a result; not recorded."""
+
+PACKAGES = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "numpy")
+
+_LOG = logging.getLogger(__name__)
 
 
-class Stopped(Exception):
-    """A signal asked to stop; its number is the argument."""
+@hydra.main(config_path=".", config_name="sweep", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Do one run of the sweep, unless its record is there already."""
+    job = HydraConfig.get()
+    method, folder = job.runtime.choices["experiment"], Path(job.runtime.output_dir)
+    own = ("experiment", "seed", *PRESENTATION)
+    overrides = [each for each in job.overrides.task if each.split("=", 1)[0] not in own]
+    try:
+        # Another command that does the same run is waited for; its record then is taken.
+        with (
+            FileLock(folder / ".lock"),
+            (folder / "output.log").open("a") as log,
+            redirect_stderr(log),
+        ):
+            said = do_run(config, method, overrides, folder, Path(job.sweep.dir) / "data")
+    except Exception:
+        # Hydra tells of the first failure alone, and when all is over.
+        _LOG.exception("FAILED: %s, seed %s, in %s", method, config.seed, folder)
+        raise
+    _LOG.info("%s, seed %s: %s", method, config.seed, said)
 
 
-def run_jobs(
-    jobs: Sequence[Job],
-    runs: Path,
-    data: Path,
-    *,
-    parallel: int,
-    progress: Progress,
-    signals: Sequence[int] = (),
-) -> list[str]:
-    """Do all jobs, some at a time; one that fails does not hold up the others.
+def do_run(
+    config: DictConfig, method: str | None, overrides: list[str], folder: Path, data: Path
+) -> str:
+    """Train and keep the record, unless it is there already; return what was done, in words.
 
     Args:
-        jobs: in this order.
-        runs: folder of the runs.
+        config: of the training, as composed.
+        method: name of the experiment.
+        overrides: what was given beside experiment and seed.
+        folder: of this run. Each attempt has a folder in it, those of killed ones are left as they
+            are; a finished attempt is not repeated.
         data: folder of the records.
-        parallel: how many at a time.
-        progress: where to show how far it is.
-        signals: filled from outside with those that came, see `signals_noted`.
-
-    Returns:
-        a sentence for each job that failed.
 
     Raises:
-        Stopped: when a signal came; all processes are then stopped.
+        RecordError: when the record that is there cannot be read.
+        ValueError: when it is one of a run with another configuration, or no method is named.
     """
-    waiting, running, finished = list(jobs), list[RunningJob](), 0
-    failures: list[str] = []
-    try:
-        while waiting or running:
-            if signals:
-                raise Stopped(signals[0])
-            while waiting and len(running) < parallel:
-                running.append(RunningJob(waiting.pop(0), runs, data))
-                progress.say(f"{running[-1].job.name}: started, log in {running[-1].log}")
-            for each in list(running):
-                status = each.poll()
-                if status is None:
-                    continue
-                running.remove(each)
-                if status == 0:
-                    finished += 1
-                    progress.say(f"{each.job.name}: done")
-                else:
-                    failures.append(f"{each.job.name}: exit status {status}, log in {each.log}")
-                    progress.say(f"FAILED: {failures[-1]}\n{each.last_words()}")
-            progress.show(running, finished, len(failures))
-            time.sleep(PAUSE)
-    finally:
-        stop_all(running)
-    return failures
-
-
-@contextmanager
-def signals_noted() -> Iterator[list[int]]:
-    """Note the signals that usually end a program in a list, in place of obeying them.
-
-    An exception from a handler could come between the start of a process and its being known.
-    """
-    noted: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        noted.append(number)
-
-    before = {n: signal.signal(n, note) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield noted
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def only_one(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process.
-
-    Raises:
-        PlanError: when another one holds it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise PlanError(
-                f"--runs: expected a folder that nobody else uses, but another command works in "
-                f"{folder}; wait for it, or choose another folder"
-            ) from None
-        yield
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, collect, draw and report; return 1 if a run failed, 2 if nothing could start."""
-    options = _parser().parse_args(arguments)
-    data = options.data or options.output / "data"
-    runs = options.runs or options.output / "runs"
-    try:
-        methods = options.methods or known_methods()
-        jobs = make_jobs(methods, options.seeds, options.steps, options.overrides)
-        with only_one(runs):
-            left = still_to_do(jobs, data)
-            sys.stderr.write(
-                f"{len(jobs)} runs, {len(jobs) - len(left)} of them done before; "
-                f"records in {data}, runs in {runs}\n"
+    if method is None:
+        raise ValueError("experiment: expected the name of a method, given null")
+    content = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(content, dict)
+    path, wanted = record_path(data, method, config.seed), settings(content)
+    if path.exists():
+        if differing := _differing(Record.read(path).config, wanted):
+            raise ValueError(
+                f"{path}: expected a run with the configuration asked for, given one that differs "
+                f"in {differing}; take another folder, hydra.sweep.dir=PATH, or move the file away"
             )
-            parallel = min(options.parallel, max(len(left), 1))
-            show = make_progress(len(left), options.steps, parallel)
-            with signals_noted() as signals, show as progress:
-                failures = run_jobs(
-                    left, runs, data, parallel=parallel, progress=progress, signals=signals
-                )
-    except PlanError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    except Stopped as stopped:
-        sys.stderr.write("stopped; the same command goes on from the last finished run\n")
-        return 128 + int(stopped.args[0])
-    if not options.no_report:
-        # Imported late: what draws must not keep anything from running.
-        from experiments.paper.report import write_report
-
-        try:
-            sys.stderr.write(f"report: {write_report(data, options.output)}\n")
-        except RecordError as error:
-            failures.append(f"report: {error}")
-    for failure in failures:
-        sys.stderr.write(f"FAILED: {failure}\n")
-    return 1 if failures else 0
+        return f"done before, {path}"
+    attempts = sorted(folder.glob("attempt_*"))
+    for attempt in attempts:
+        run = RunFolder(attempt)
+        if (attempt / SUMMARY).is_file() and settings(run.load_settings()) == wanted:
+            break
+    else:
+        run = RunFolder.create(folder / f"attempt_{1 + len(attempts)}")
+        train(config, run)
+    return f"done, {make_record(run, method, overrides).save(data)}"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    add = parser.add_argument
-    add("--methods", type=_names, help="comma-separated; all of conf/experiment if left out")
-    add("--seeds", type=_seeds, default=[0, 1, 2], help="such as 0,1,2 (default) or 0-4")
-    add("--steps", type=int, default=20_000, help="environment steps of training (%(default)s)")
-    add("--parallel", type=_positive, default=os.cpu_count() or 1, help="runs at the same time")
-    add("--output", type=Path, default=OUTPUT, help="of everything that follows (%(default)s)")
-    add("--data", type=Path, help="of the records; OUTPUT/data if left out")
-    add("--runs", type=Path, help="of the runs' own folders; OUTPUT/runs if left out")
-    add("--no-report", action="store_true", help="stop after the records")
-    add("overrides", nargs="*", metavar="KEY=VALUE", help="of the training configuration")
-    return parser
+def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
+    """Return the record of a finished run, with what its policy does afterwards.
 
-
-def _names(text: str) -> list[str]:
-    return [each.strip() for each in text.split(",") if each.strip()]
-
-
-def _seeds(text: str) -> list[int]:
-    seeds: list[int] = []
-    for part in _names(text):
-        first, separator, last = part.partition("-")
-        if not first.isdecimal() or (separator and not last.isdecimal()):
-            raise argparse.ArgumentTypeError(
-                f"expected whole numbers and ranges such as 0,1,2 or 0-4, given {text!r}"
+    Args:
+        folder: of a run with the CSV logger.
+        method: see `do_run`.
+        overrides: see `do_run`.
+    """
+    summary = json.loads((folder.path / SUMMARY).read_text())
+    curves = read_scalars(folder.path / "metrics")
+    return Record(
+        method=method,
+        seed=summary["seed"],
+        overrides=tuple(overrides),
+        config=settings(folder.load_settings()),
+        versions=versions(),
+        commit=commit(),
+        steps=summary["steps"],
+        seconds=summary["seconds"],
+        curves={
+            name: Series(
+                steps=tuple(int(step) for step in steps),
+                values=tuple(_short(float(each)) for each in values),
             )
-        seeds += range(int(first), int(last if separator else first) + 1)
-    return seeds
+            for name, (steps, values) in curves.items()
+        },
+        training_violations=summary["training_violations"],
+        evaluation=Evaluation.model_validate(summary["evaluation"]),
+        afterwards=evaluate_afterwards(folder),
+    )
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number >= 1, given {text!r}")
-    return int(text)
+def settings(config: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return what decides a run's result, as JSON would give it back.
+
+    Args:
+        config: plain data, with every interpolation resolved.
+    """
+    return json.loads(
+        json.dumps({name: each for name, each in config.items() if name not in PRESENTATION})
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes, and the kind of machine."""
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in PACKAGES},
+        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def commit() -> str | None:
+    """Return the checkout's commit, ending in ``-dirty`` if files differ, or None."""
+    try:
+        result = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return result.stdout.strip() or None
+
+
+def _differing(given: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    return [
+        f"{name} ({'absent' if one is None else one}, asked for "
+        f"{'absent' if other is None else other})"
+        for name, (one, other) in differences(given, wanted).items()
+    ]
+
+
+def _short(value: float) -> float:
+    """Return the value with as many digits as a figure shows; counts stay whole."""
+    return value if value.is_integer() else float(f"{value:.6g}")
+
+
+if __name__ == "__main__":
+    # As Ctrl-C does, so that no run goes on when the sweep is stopped.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    main()

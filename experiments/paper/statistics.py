@@ -7,14 +7,13 @@ seeds of each method are drawn again with replacement, methods apart from each o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from experiments.paper.records import MODES, PROCESSOR, RETURN, SECONDS, VIOLATIONS, Record, Series
+from experiments.paper.records import PROCESSOR, RETURN, VIOLATIONS, Record, Series
 
 RESAMPLES, CONFIDENCE, BOOTSTRAP_SEED = 10_000, 0.95, 0
 TRIMMED = 0.25
@@ -26,26 +25,33 @@ EDGE = 0.1
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Interval:
-    """An interquartile mean over runs.
+class Interval(NamedTuple):
+    """An interquartile mean over runs, or a difference of two.
 
     Args:
         value: the mean.
-        low: lower end of its bootstrap interval, ``None`` for a single run.
+        low: lower end of its bootstrap interval; the value itself for a single run.
         high: upper end.
-        runs: how many.
+        runs: number of runs, of the method with fewer.
     """
 
     value: float
-    low: float | None
-    high: float | None
+    low: float
+    high: float
     runs: int
 
+    def text(self, digits: int = 2) -> str:
+        """Return the mean and its interval in words."""
+        if self.runs == 1:
+            return f"{self.value:,.{digits}f} (one run)"
+        if self.low == self.value == self.high:
+            return f"{self.value:,.{digits if self.value else 0}f}"
+        text = f"{self.value:,.{digits}f} [{self.low:,.{digits}f}, {self.high:,.{digits}f}]"
+        return text.replace("-", "\N{MINUS SIGN}")
 
-@dataclass(frozen=True)
-class Band:
-    """Interquartile means over training, each array ``(entries,)``; see `Interval`."""
+
+class Band(NamedTuple):
+    """Interquartile means over training and their intervals' ends, each array ``(entries,)``."""
 
     steps: Floats
     value: Floats
@@ -53,43 +59,11 @@ class Band:
     high: Floats
 
 
-@dataclass(frozen=True)
-class Reached:
-    """When a run first had a score: environment steps, wall seconds, processor seconds."""
+class Reached(NamedTuple):
+    """When a run first had a score: environment steps and processor seconds."""
 
-    steps: int
-    seconds: float
+    steps: float
     processor_seconds: float
-
-
-@dataclass(frozen=True)
-class Summary:
-    """A method in numbers.
-
-    Args:
-        method: its name.
-        seeds: of its runs.
-        score: of the final evaluation, by mode.
-        area: see `area_under_score`.
-        reached: how many runs came to `TARGET_SCORE`.
-        steps_to_score: of these runs to that score; ``None`` unless every run came there, because
-            leaving out the slow ones would flatter.
-        seconds_to_score: the same in wall seconds.
-        processor_seconds_to_score: the same in processor seconds.
-        violations: per run in training and evaluations together, by constraint.
-        violations_per_episode: see `violations_per_episode`, at the start and at the end.
-    """
-
-    method: str
-    seeds: tuple[int, ...]
-    score: dict[str, Interval]
-    area: Interval
-    reached: int
-    steps_to_score: Interval | None
-    seconds_to_score: Interval | None
-    processor_seconds_to_score: Interval | None
-    violations: dict[str, Interval]
-    violations_per_episode: tuple[Interval, Interval]
 
 
 def interquartile_mean(values: Sequence[float]) -> Interval:
@@ -98,12 +72,12 @@ def interquartile_mean(values: Sequence[float]) -> Interval:
     Raises:
         ValueError: for no values.
     """
-    data = np.asarray(values, dtype=np.float64)
-    if not len(data):
+    if not len(values):
         raise ValueError("values: expected those of one run or more, given none")
+    data = np.asarray(values, dtype=np.float64)
     value = float(_trimmed(data))
     if len(data) == 1:
-        return Interval(value, None, None, 1)
+        return Interval(value, value, value, 1)
     low, high = _bootstrap((data,), _trimmed)
     return Interval(value, float(low), float(high), len(data))
 
@@ -144,105 +118,57 @@ def score_curve(record: Record) -> Series:
     scale = record.config["env"]["score"]
     zero, one = scale["zero"], scale["one"]
     returns = record.curves[RETURN]
-    return Series(returns.steps, tuple((value - zero) / (one - zero) for value in returns.values))
+    values = tuple((value - zero) / (one - zero) for value in returns.values)
+    return Series(steps=returns.steps, values=values)
 
 
 def area_under_score(record: Record) -> float:
     """Return the mean score while training, each entry weighted by the steps since the last."""
     curve = score_curve(record)
-    weights = np.diff(curve.steps, prepend=0)
-    return float(np.average(curve.values, weights=weights))
+    return float(np.average(curve.values, weights=np.diff(curve.steps, prepend=0)))
 
 
 def reached(record: Record, score: float = TARGET_SCORE) -> Reached | None:
-    """Return when a run's training score first was that high, or ``None`` if it never was."""
-    curve = score_curve(record)
+    """Return when a run's training score first was that high, or None if it never was."""
+    curve, clock = score_curve(record), record.curves[PROCESSOR]
     for step, value in zip(curve.steps, curve.values, strict=True):
         if value >= score:
-            seconds, processor = (
-                float(np.interp(step, [0, *series.steps], [0.0, *series.values]))
-                for series in (record.curves[SECONDS], record.curves[PROCESSOR])
-            )
-            return Reached(step, seconds, processor)
+            seconds = np.interp(step, [0, *clock.steps], [0.0, *clock.values])
+            return Reached(float(step), float(seconds))
     return None
 
 
-def violation_curve(record: Record) -> Series:
-    """Return the violating steps since the start, all constraints together."""
-    curves = [record.curves[VIOLATIONS + name] for name in record.constraints]
-    values = np.sum([curve.values for curve in curves], axis=0)
-    return Series(curves[0].steps, tuple(values.tolist()))
+def violation_rate(record: Record, constraint: str) -> Series:
+    """Return violating steps per episode in each round of episodes, at the round's middle.
 
-
-def round_ends(record: Record) -> list[float]:
-    """Return the steps at which all agents' episodes end together, or the run's end if none do.
-
-    Batteries run low late in an episode, so a window that ends within episodes misleads.
+    All agents' episodes end together at a round's end. Batteries run low late in an episode, so a
+    window that ends within episodes misleads; a run shorter than an episode is one window.
     """
-    evaluation = record.evaluation[MODES[0]]
-    length = evaluation.steps / evaluation.episodes * record.config["env"]["agents"]
-    return [length * i for i in range(1, int(record.steps // length) + 1)] or [float(record.steps)]
+    outcome = record.evaluation.stochastic
+    length = outcome.steps / outcome.episodes
+    together = length * record.config["env"]["agents"]
+    whole = int(record.steps // together)
+    edges = together * np.arange(1.0 + whole) if whole else np.array([0.0, record.steps])
+    curve = record.curves[VIOLATIONS + constraint]
+    counts = np.diff(np.interp(edges, [0, *curve.steps], [0.0, *curve.values]))
+    middles = tuple(round(each) for each in ((edges[:-1] + edges[1:]) / 2).tolist())
+    return Series(steps=middles, values=tuple((counts * length / np.diff(edges)).tolist()))
 
 
 def violations_per_episode(record: Record) -> tuple[float, float]:
     """Return violating steps an episode in the first and in the last `EDGE` of training.
 
-    Both are whole rounds of episodes, at least one; see `round_ends`.
+    Both are whole rounds of episodes, at least one; see `violation_rate`.
     """
-    ends = [0.0, *round_ends(record)]
-    window = max(1, round(EDGE * (len(ends) - 1)))
-    curve = violation_curve(record)
-    counts = np.interp(ends, [0, *curve.steps], [0.0, *curve.values])
-    evaluation = record.evaluation[MODES[0]]
-    episodes = ends[window] * evaluation.episodes / evaluation.steps
-    return float(counts[window] / episodes), float((counts[-1] - counts[-1 - window]) / episodes)
+    rates = np.sum([violation_rate(record, name).values for name in record.constraints], axis=0)
+    window = max(1, round(EDGE * len(rates)))
+    return float(rates[:window].mean()), float(rates[-window:].mean())
 
 
-def total_violations(record: Record) -> int:
-    """Return the violating steps of training and both evaluations, all constraints together."""
-    return sum(record.violations.values())
-
-
-def by_method(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Return the records of each method, in the order in which methods first appear."""
-    grouped: dict[str, list[Record]] = {}
-    for record in records:
-        grouped.setdefault(record.method, []).append(record)
-    return grouped
-
-
-def summarise(runs: Sequence[Record]) -> Summary:
-    """Return one method in numbers.
-
-    Raises:
-        ValueError: for no runs, and for runs of several methods.
-    """
-    if len({run.method for run in runs}) != 1:
-        raise ValueError(
-            f"runs: expected those of one method, given {sorted({run.method for run in runs})}"
-        )
-    moments = [moment for run in runs if (moment := reached(run)) is not None]
-    whole = len(moments) == len(runs)
-    start, end = zip(*(violations_per_episode(run) for run in runs), strict=True)
-    return Summary(
-        method=runs[0].method,
-        seeds=tuple(run.seed for run in runs),
-        score={
-            mode: interquartile_mean([run.evaluation[mode].score for run in runs]) for mode in MODES
-        },
-        area=interquartile_mean([area_under_score(run) for run in runs]),
-        reached=len(moments),
-        steps_to_score=interquartile_mean([m.steps for m in moments]) if whole else None,
-        seconds_to_score=interquartile_mean([m.seconds for m in moments]) if whole else None,
-        processor_seconds_to_score=(
-            interquartile_mean([m.processor_seconds for m in moments]) if whole else None
-        ),
-        violations={
-            name: interquartile_mean([run.violations[name] for run in runs])
-            for name in runs[0].constraints
-        },
-        violations_per_episode=(interquartile_mean(start), interquartile_mean(end)),
-    )
+def start_and_end(runs: Sequence[Record]) -> tuple[Interval, Interval]:
+    """Return the interquartile means of `violations_per_episode`, at the start and at the end."""
+    start, end = zip(*map(violations_per_episode, runs), strict=True)
+    return interquartile_mean(start), interquartile_mean(end)
 
 
 def _trimmed(values: Floats, axis: int = -1) -> Floats:

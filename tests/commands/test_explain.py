@@ -10,10 +10,10 @@ from hydra import compose, initialize_config_dir
 from cnfp_torchrl.commands.explain import explain_run, main
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.callbacks import replay_episodes
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
-from cnfp_torchrl.training.watching import replay_episodes
 
 TINY = [
     "collector.total_frames=64",

@@ -12,7 +12,15 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
 
 from cnfp_torchrl.envs import GeometryTransform, constrain_env
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, GeometryError
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    Ellipsoid,
+    GeometryError,
+    HalfSpaces,
+    TaskSpaceBall,
+)
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
@@ -129,7 +137,7 @@ def test_a_set_must_be_one() -> None:
     for bad, message in (
         (
             Ball(center, -radius, validate_args=False),
-            r"'broken' .*'radius' at index \[0\].*radius > 0",
+            r"'broken' .*'radius' at index \[0\].*radius >= 0",
         ),
         (
             Ball(center / 0, radius, validate_args=False),
@@ -193,7 +201,40 @@ def test_errors_of_a_constraints_own_code_name_it(error: Exception) -> None:
     with pytest.raises(type(error)) as caught:
         constrain_env(PointNavEnv([3]), Told(lambda _: raise_(error)))
     assert caught.value is error
-    assert error.__notes__ == ["raised by constraint 'told', Told.constraint_set"]
+    by_whom, when = error.__notes__
+    assert by_whom == "raised by constraint 'told', Told.constraint_set"
+    assert "zero of the observation spec" in when
+
+
+def one_half_space_a_state(state: TensorDictBase) -> HalfSpaces:
+    like = state["observation"][..., :2]
+    return HalfSpaces(like, torch.ones_like(like[..., 0]), validate_args=False)
+
+
+def one_jacobian_a_state(state: TensorDictBase) -> TaskSpaceBall:
+    like = state["observation"][..., :2]
+    one = torch.ones_like(like[..., 0])
+    return TaskSpaceBall(like, one, one, validate_args=False)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2,), (3,), (2, 2)])
+@pytest.mark.parametrize(
+    ("publish", "field"),
+    [(one_half_space_a_state, "normals"), (one_jacobian_a_state, "jacobian")],
+)
+def test_a_batch_in_the_place_of_rows_is_refused(
+    batch: tuple[int, ...], publish: Callable[..., ConstraintSet], field: str
+) -> None:
+    message = f"'told', field '{field}': expected one shape" if batch else "'told'"
+    with pytest.raises(GeometryError, match=message):
+        constrain_env(PointNavEnv(batch), Told(publish))
+
+
+def test_one_set_for_all_states_is_none_that_follows_the_batch() -> None:
+    env = constrain_env(
+        PointNavEnv([2]), Told(lambda _: HalfSpaces(torch.ones(2, 2), torch.ones(2)))
+    )
+    assert env.reset()["constraints", "told", "normals"].shape == (2, 2, 2)
 
 
 def test_an_attribute_error_is_not_taken_for_a_missing_spec() -> None:

@@ -50,9 +50,16 @@ def test_a_reset_starts_from_zero() -> None:
     assert torch.equal(after["raw_reward"][1:], state["raw_reward"][1:])
 
 
-@pytest.mark.parametrize("penalty", [0.0, -100.0, float("nan"), float("inf")])
+def test_no_penalty_leaves_the_reward_alone() -> None:
+    env = TransformedEnv(PointNavEnv([64], seed=0), Compose(RewardPenalty(0)))
+    steps = env.rollout(50, break_when_any_done=False)["next"]
+    assert steps["cost"].any()
+    assert torch.equal(steps["reward"], steps["raw_reward"])
+
+
+@pytest.mark.parametrize("penalty", [-100.0, float("nan"), float("inf")])
 def test_a_bad_penalty_is_refused(penalty: float) -> None:
-    with pytest.raises(ValueError, match="penalty: expected a number > 0, given"):
+    with pytest.raises(ValueError, match="penalty: expected a number >= 0, given"):
         RewardPenalty(penalty)
 
 
@@ -78,6 +85,15 @@ def test_only_training_is_penalised() -> None:
         assert bool((data["next", "reward"] == -100).any()) is expected
         assert data["next", "cost"].any()
         assert data["next", "episode_reward"].min() > -100
+
+
+@pytest.mark.parametrize(("number", "paid"), [("0", None), ("0.0", None), ("7", 7.0)])
+def test_a_number_is_a_penalty_too_and_zero_is_none(number: str, paid: float | None) -> None:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", overrides=[f"env.penalty={number}"])
+    env = build_environment(config, batch_size=[2], with_penalty=True)
+    penalties = [each.penalty for each in env.transform if isinstance(each, RewardPenalty)]
+    assert penalties == ([] if paid is None else [paid])
 
 
 def test_a_run_learns_from_the_penalty_and_reports_the_raw_return(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_learns_and_breaks_nothing(
     assert steps >= 512
     assert f"obstacle: 0 violations in {steps} steps" in printed
     assert f"battery: 0 violations in {steps} steps" in printed
-    assert executed.invalid_fields() == {"obstacle": 0, "battery": 0, "bounds": 0}
+    assert executed.violations() == {"obstacle": 0, "battery": 0, "bounds": 0}
     optimized.assert_all_learned()
 
 
@@ -80,7 +80,7 @@ def test_without_the_line_it_breaks_constraints(
     run: Callable[..., str], executed: Executed
 ) -> None:
     printed = run("sac_made_safe", "--steps", 2048, "--agents", 32, "--updates", 0, "--unsafe")
-    counts = executed.invalid_fields()
+    counts = executed.violations()
     assert counts["obstacle"] > 50
     assert counts["battery"] > 50
     # The script counts what the environment says, and this file agrees with it.

@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.envs import find_task_view
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.figures.banner import flow_banner
 from tests.visual.cases import PLANE, first, make_snapshot

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry import (
-    MINIMUM_SLACK,
     Ball,
     Box,
     ConstraintSet,
@@ -23,6 +22,9 @@ from cnfp_torchrl.geometry import (
 )
 
 DTYPES = (torch.float32, torch.float64)
+
+LEAST_SLACK = 5e-5
+"""Of the points about which gauges are tried, in action units."""
 
 Make = Callable[[tuple[int, ...], int], tuple[ConstraintSet, Tensor]]
 """From a batch shape and a dimension: sets some units wide, and a point well inside each."""
@@ -201,7 +203,7 @@ class Case:
         return picked.to(dtype) * self.size / picked.abs().amax(-1, keepdim=True).to(dtype)
 
     def anchors(self, dtype: torch.dtype) -> list[Tensor]:
-        """Return anchors from the middle out to where the minimum slack is left, in a dtype."""
+        """Return anchors from the middle out to where the least slack is left, in a dtype."""
         sets, inside = self.cast(dtype), self.inside.to(dtype)
         bounds = self.bounds.with_fields(lambda field, _: field.to(dtype))
         magnitude = bounds.high.amax()
@@ -213,7 +215,7 @@ class Case:
             for depth in (0.3, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
                 trial = inside + direction * ((1 - depth) / gauge).unsqueeze(-1)
                 slack = torch.minimum(*(x.slack(trial) for x in twice))
-                chosen = torch.where((slack >= MINIMUM_SLACK).unsqueeze(-1), trial, chosen)
+                chosen = torch.where((slack >= LEAST_SLACK).unsqueeze(-1), trial, chosen)
             anchors.append(chosen)
         return anchors
 

@@ -59,9 +59,9 @@ def test_a_jacobian_of_zero_allows_all_or_nothing(offset: float, holds: bool) ->
     actions = torch.randn(20, 3, dtype=torch.float64)
     assert (ball.contains(actions) == holds).all()
     assert ((ball.slack(actions) > 0) == holds).all()
-    anchor, active = lexicographic_anchor([Box(-ones, ones), ball])
-    assert active.tolist() == [True, holds]
-    assert (ball.gauge(actions, anchor) == 0).all()
+    found = lexicographic_anchor([Box(-ones, ones), ball])
+    assert found.active.tolist() == [True, holds]
+    assert (ball.gauge(actions, found.anchor) == 0).all()
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1e-20, 1e-10, 1.0, 1e10, 1e25])

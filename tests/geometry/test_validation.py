@@ -34,11 +34,11 @@ def t(*values: Any) -> Tensor:
 RECTANGLES = t([[1.0, 1.0], [2.0, 2.0]])
 
 BAD: list[tuple[Callable[[], ConstraintSet], tuple[str, ...]]] = [
-    (lambda: Box(t(0.0, 1.0), t(1.0, 1.0)), ("Box", "'low'", "[1]", "low < high", "1.0")),
+    (lambda: Box(t(0.0, 2.0), t(1.0, 1.0)), ("Box", "'low'", "[1]", "low <= high", "2.0")),
     (lambda: Box(t([0.0], [NAN]), t(1.0)), ("Box", "'low'", "[1, 0]", "a number", "nan")),
     (lambda: Ball(t(0.0, INF), t(1.0)[0]), ("Ball", "'center'", "[1]", "finite", "inf")),
-    (lambda: Ball(t(0.0, 0.0), t(1.0, 0.0, 1.0)), ("Ball", "'radius'", "[1]", "> 0", "0.0")),
-    (lambda: Ball(t(0.0, 0.0), t(-2.0)), ("Ball", "'radius'", "[0]", "> 0", "-2.0")),
+    (lambda: Ball(t(0.0, 0.0), t(1.0, -0.5, 1.0)), ("Ball", "'radius'", "[1]", ">= 0", "-0.5")),
+    (lambda: Ball(t(0.0, 0.0), t(-2.0)), ("Ball", "'radius'", "[0]", ">= 0", "-2.0")),
     (lambda: Ball(t(0.0), t(INF)), ("Ball", "'radius'", "[0]", "finite", "inf")),
     (
         lambda: Ellipsoid(t(0.0, 0.0), t([1.0, 0.0], [0.5, -1.0])),
@@ -69,8 +69,8 @@ BAD: list[tuple[Callable[[], ConstraintSet], tuple[str, ...]]] = [
         ("HalfSpaces", "as many offsets as normals", "2 and 1"),
     ),
     (
-        lambda: TaskSpaceBall(t([1.0, 0.0]), t(0.0), t(0.0)[0]),
-        ("TaskSpaceBall", "'radius'", "> 0", "0.0"),
+        lambda: TaskSpaceBall(t([1.0, 0.0]), t(0.0), t(-0.5)[0]),
+        ("TaskSpaceBall", "'radius'", ">= 0", "-0.5"),
     ),
     (
         lambda: TaskSpaceBall(t([1.0, -INF]), t(0.0), t(1.0)[0]),
@@ -85,12 +85,12 @@ BAD: list[tuple[Callable[[], ConstraintSet], tuple[str, ...]]] = [
         ("WeightedL1Ball", "'weights'", "[1]", "finite", "inf"),
     ),
     (
-        lambda: WeightedL1Ball(t(1.0, 1.0), t(1.0, 0.0)),
-        ("WeightedL1Ball", "'bound'", "[1]", "> 0", "0.0"),
+        lambda: WeightedL1Ball(t(1.0, 1.0), t(1.0, -0.5)),
+        ("WeightedL1Ball", "'bound'", "[1]", ">= 0", "-0.5"),
     ),
     (
         lambda: PositivePart(t(1.0, 1.0), t(-1.0)),
-        ("PositivePart", "'bound'", "[0]", "> 0", "-1.0"),
+        ("PositivePart", "'bound'", "[0]", ">= 0", "-1.0"),
     ),
     (
         lambda: VisibleRegion(t(0.0, 0.0), RECTANGLES.flip(-2), t(1.0)[0]),
@@ -156,6 +156,20 @@ def test_a_region_needs_action_bounds_first() -> None:
         Region((ball,), t(0.0, 0.0))
     with pytest.raises(GeometryError, match="one action dimension"):
         Region((Box(t(-1.0), t(1.0)), ball), t(0.0, 0.0))
+
+
+def test_sets_without_interior_are_sets() -> None:
+    zero = t(0.0)[0]
+    for each in (
+        Box(t(0.5, -1.0), t(0.5, 1.0)),
+        Ball(t(0.0, 0.0), zero),
+        TaskSpaceBall(t([1.0, 0.0]), t(0.0), zero),
+        WeightedL1Ball(t(1.0, 1.0), zero),
+        PositivePart(t(1.0, 0.0), zero),
+    ):
+        assert each.slack(t(0.5, 0.5)).isfinite()
+        wider = each.inflated(t(0.25))
+        assert wider.contains(t(0.5, 0.0) if isinstance(each, Box) else t(0.0, 0.0))
 
 
 @pytest.mark.parametrize("event_dims", [None, {"radius": 0}, {"center": 0, "radius": 0}])

@@ -82,13 +82,17 @@ def doubled(tensordict: TensorDictBase) -> TensorDictBase:
 # What it reads ------------------------------------------------------------------------------------
 
 
+GEOMETRY = {"center", "radius", "low", "high"}
+ANCHOR_ENTRIES = {"active", "relaxation", "row_relaxation", "anchor"}
+
+
 @pytest.mark.parametrize(
     ("flow", "reads"),
     [
-        ("exact", {"center", "radius", "low", "high", "active", "anchor"}),
-        ("radial", {"center", "radius", "low", "high", "active", "anchor"}),
-        ("projection", {"center", "radius", "low", "high", "active", "anchor"}),
-        ("squash", {"center", "radius", "low", "high"}),
+        ("exact", {*GEOMETRY, *ANCHOR_ENTRIES}),
+        ("radial", {*GEOMETRY, *ANCHOR_ENTRIES}),
+        ("projection", {*GEOMETRY, *ANCHOR_ENTRIES}),
+        ("squash", GEOMETRY),
         ("unconstrained", set()),
     ],
 )
@@ -109,7 +113,7 @@ def test_each_missing_entry_is_named(
 ) -> None:
     actor = make_actor(flow=flow)
     for key in actor.in_keys[1:]:
-        remedy = "ConstraintAnchor" if key[-1] in ("anchor", "active") else key[1]
+        remedy = "ConstraintAnchor" if key[-1] in ANCHOR_ENTRIES else key[1]
         message = re.escape(f"expected {key}, found keys [") + f".*append.*{remedy}"
         with pytest.raises(KeyError, match=message):
             actor(state.exclude(key))

@@ -44,6 +44,15 @@ def set_action(acted: TensorDictBase, action: Tensor) -> TensorDictBase:
     return acted.set("action", changed)
 
 
+def relaxed(acted: TensorDictBase, name: str, amount: float) -> TensorDictBase:
+    """Widen one agent's set, as where the constraint cannot be had."""
+    for key in ("relaxation", "row_relaxation"):
+        if (entry := acted.get(("constraints", name, key), None)) is not None:
+            entry[AGENT] = amount
+    acted["constraints", name, "active"][AGENT] = amount == 0
+    return acted
+
+
 def just_beyond(bound: Tensor, towards: float) -> Tensor:
     return torch.nextafter(bound, torch.tensor(towards))
 
@@ -111,24 +120,22 @@ def test_an_action_of_nan_raises(guard: ExecutedActionGuard, acted: TensorDictBa
 
 
 @pytest.mark.parametrize("name", ["battery", "obstacle"])
-def test_inactive_constraints_are_not_asked(
+def test_relaxed_constraints_are_asked_for_no_more_than_they_were_relaxed_to(
     guard: ExecutedActionGuard, acted: TensorDictBase, name: str
 ) -> None:
     set_action(acted, BREAKING[name](acted))
-    flags = acted["constraints", name, "active"].clone()
-    flags[AGENT] = False
-    guard(acted.set(("constraints", name, "active"), flags))
-    flags = ~flags
+    guard(relaxed(acted, name, 1e-3))
+    message = f"constraint '{name}': expected an action inside its set widened by 1e-09"
+    with pytest.raises(ConstraintViolationError, match=message):
+        guard(relaxed(acted, name, 1e-9))
     with pytest.raises(ConstraintViolationError, match=f"constraint '{name}'"):
-        guard(acted.set(("constraints", name, "active"), flags))
+        guard(relaxed(acted, name, 0.0))
 
 
-def test_the_one_named_is_active(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
-    # An agent before it breaks another constraint, of lower priority, which is inactive there.
+def test_the_one_named_is_broken(guard: ExecutedActionGuard, acted: TensorDictBase) -> None:
+    # An agent before it leaves another set, of lower priority, which is relaxed there.
     set_action(acted, BREAKING["battery"](acted))
-    flags = acted["constraints", "battery", "active"].clone()
-    flags[AGENT] = False
-    acted["constraints", "battery", "active"] = flags
+    relaxed(acted, "battery", 1e-3)
     acted["action"][AGENT + 1] = BREAKING["obstacle"](acted)
     message = rf"constraint 'obstacle'.*batch index \[{AGENT + 1}\]"
     with pytest.raises(ConstraintViolationError, match=message):

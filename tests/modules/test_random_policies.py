@@ -1,5 +1,7 @@
 """Random actions within the constraints: alone, and before a learned policy."""
 
+import copy
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -7,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch._dynamo.testing import CompileCounter
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -133,6 +136,32 @@ def test_in_a_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
     seen = [step for batch in collector for step in random_steps(batch)]
     assert seen == [True] * 3 + [False] * 5
     assert policy.frames_left <= 0
+
+
+def test_counting_down_compiles_nothing_anew(make_actor: MakeActor, state: TensorDictBase) -> None:
+    torch._dynamo.reset()
+    counter = CompileCounter()
+    warm_up = WarmUpPolicy(make_actor(), 5 * state.numel())
+    compiled = torch.compile(warm_up, backend=counter)
+    counts = []
+    with torch.no_grad():
+        for _ in range(8):
+            compiled(state.clone())
+            counts.append(counter.frame_count)
+    assert warm_up.frames_left == 0
+    # Once for random actions, and once more for the actor's own.
+    assert counts[0] == counts[4]
+    assert counts[5] == counts[-1]
+
+
+def test_copies_count_alone(make_actor: MakeActor, state: TensorDictBase) -> None:
+    policy = WarmUpPolicy(make_actor(), 20)
+    copies = copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))
+    policy(state.clone())
+    assert policy.frames_left == 12
+    assert [each.frames_left for each in copies] == [20, 20]
+    policy.frames_left = 20
+    assert policy.frames_left == 20
 
 
 def test_a_negative_number_of_frames_is_refused(make_actor: MakeActor) -> None:

@@ -1,5 +1,15 @@
-"""Fixtures of the trainer's tests, for runs that are to be recorded."""
+"""Fixtures of the trainer's and of the pictures' tests, and reports that are quick to draw."""
 
+import pytest
+
+from experiments.paper import statistics
 from tests.training.conftest import make_config, tiny_run
+from tests.visual.conftest import draws
 
-__all__ = ["make_config", "tiny_run"]
+__all__ = ["draws", "make_config", "tiny_run"]
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw and resample less than a report does."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 200)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from experiments.paper.records import Outcome, Record, Series
+from experiments.paper.records import Evaluation, HostileRun, Outcome, Record, Series
 
 CONSTRAINTS = ("obstacle", "battery")
 METHODS: dict[str, tuple[float, float]] = {
@@ -19,16 +21,26 @@ METHODS: dict[str, tuple[float, float]] = {
 """Final score and violations a step at the end of training, for each method."""
 
 
-def make_outcome(
-    score: float = 1.0, violations: int = 0, *, episodes: int = 400, error: float = 0.5
-) -> Outcome:
+def changed(record: Record, **fields: Any) -> Record:
+    """Return the record with other fields, unchecked."""
+    return record.model_copy(update=fields)
+
+
+def make_outcome(score: float = 1.0, violations: int = 0) -> Outcome:
     return Outcome(
         return_mean=118 * score - 104,
-        return_standard_error=error,
+        return_standard_error=0.5,
         score=score,
         violations=dict.fromkeys(CONSTRAINTS, violations),
-        episodes=episodes,
-        steps=100 * episodes,
+        episodes=400,
+        steps=40_000,
+    )
+
+
+def make_evaluation(score: float = 1.0, violations: int = 0) -> Evaluation:
+    return Evaluation(
+        stochastic=make_outcome(score, violations),
+        deterministic=make_outcome(score + 0.02, violations),
     )
 
 
@@ -37,42 +49,28 @@ def make_record(
     seed: int = 0,
     *,
     steps: int = 20_000,
-    interval: int = 500,
     score: float = 1.0,
     rate: float = 0.0,
 ) -> Record:
     """Return a record whose score rises to `score` and which violates less and less, to `rate`."""
     generator = np.random.default_rng([seed, len(method)])
-    at = np.arange(interval, steps + 1, interval)
+    at = np.arange(500, steps + 1, 500)
     level = score * (1 - np.exp(-5 * at / steps)) + generator.normal(0, 0.02, len(at))
-    returns = 118 * level - 104
     rates = rate * (1 + 9 * np.exp(-5 * at / steps))
-    total = np.cumsum(generator.poisson(rates * interval))
+    total = np.cumsum(generator.poisson(rates * 500)).astype(float)
     moments = at / 120.0 * generator.uniform(0.9, 1.1)
-    grid = tuple(at.tolist())
     curves = {
-        "train/return": Series(grid, tuple(returns.tolist())),
-        "train/seconds": Series(grid, tuple(moments.tolist())),
-        "train/processor_seconds": Series(grid, tuple((0.8 * moments).tolist())),
-        "train/alpha": Series(grid, tuple(np.exp(-3 * at / steps).tolist())),
+        "train/return": 118 * level - 104,
+        "train/processor_seconds": 0.8 * moments,
+        "train/alpha": np.exp(-3 * at / steps),
+        **dict.fromkeys((f"violations/{name}" for name in CONSTRAINTS), total),
     }
-    for name in CONSTRAINTS:
-        curves[f"violations/{name}"] = Series(grid, tuple(total.astype(float).tolist()))
-    count = int(total[-1])
-    final = float(score + generator.normal(0, 0.01))
-    left = round(rate * 40_000)
-    both = {
-        "stochastic": make_outcome(final, left),
-        "deterministic": make_outcome(final + 0.02, left),
-    }
-    after = {
-        "stochastic": make_outcome(final - 0.05, 2 * left),
-        "deterministic": make_outcome(final - 0.04, 2 * left),
-    }
+    final, left = float(score + generator.normal(0, 0.01)), round(rate * 40_000)
+    after = make_evaluation(final - 0.05, 2 * left)
     return Record(
         method=method,
         seed=seed,
-        overrides=(f"collector.total_frames={steps}",),
+        overrides=(),
         config={
             "seed": seed,
             "collector": {"total_frames": steps},
@@ -82,17 +80,27 @@ def make_record(
         commit=None,
         steps=steps,
         seconds=float(moments[-1] + 5),
-        curves=curves,
-        training_violations=dict.fromkeys(CONSTRAINTS, count),
-        evaluation=both,
+        curves={
+            name: Series(steps=tuple(at.tolist()), values=tuple(values.tolist()))
+            for name, values in curves.items()
+        },
+        training_violations=dict.fromkeys(CONSTRAINTS, int(total[-1])),
+        evaluation=make_evaluation(final, left),
         afterwards={"second rectangle": after, "battery reserve 30 %": after},
     )
 
 
-def make_records(seeds: int = 3, *, steps: int = 20_000) -> list[Record]:
+def make_runs(seeds: int = 3, *, steps: int = 20_000) -> dict[str, list[Record]]:
     """Return a record for each of `METHODS` and each seed."""
-    return [
-        make_record(method, seed, steps=steps, score=score, rate=rate)
+    return {
+        method: [
+            make_record(method, seed, steps=steps, score=score, rate=rate) for seed in range(seeds)
+        ]
         for method, (score, rate) in METHODS.items()
-        for seed in range(seeds)
-    ]
+    }
+
+
+def hostile_run(flow: str, violations: int = 0) -> HostileRun:
+    return HostileRun(
+        flow=flow, network="calm", steps=1000, violations={"obstacle": 0, "battery": violations}
+    )

@@ -18,7 +18,7 @@ from experiments.paper.afterwards import (
     STRICTER_RESERVE,
     changed,
     evaluate_afterwards,
-    outcomes,
+    evaluation,
 )
 from tests.training.conftest import TINY
 
@@ -38,15 +38,15 @@ def test_an_untrained_flow_keeps_constraints_that_appear_later(run: RunFolder) -
     config = run.load_config()
     results = evaluate_afterwards(run)
     assert set(results) == set(CHANGES)
-    for modes in results.values():
-        for outcome in modes.values():
+    for each in results.values():
+        for outcome in each.both:
             assert (outcome.episodes, outcome.steps) == (40, 4000)
-            if config.flow.combine._target_.split(".")[-1] == "ExactFlow":
+            if config.flow._target_.split(".")[-1] == "ExactFlow":
                 assert outcome.violations == {"obstacle": 0, "battery": 0}
-    if config.flow.combine._target_.endswith("UnconstrainedFlow"):
-        before = outcomes(run, config)["stochastic"].violations
-        second = results["second rectangle"]["stochastic"].violations
-        reserve = results["stricter battery reserve"]["stochastic"].violations
+    if config.flow._target_.endswith("UnconstrainedFlow"):
+        before = evaluation(run, config).stochastic.violations
+        second = results["second rectangle"].stochastic.violations
+        reserve = results["stricter battery reserve"].stochastic.violations
         assert second["obstacle"] > before["obstacle"]
         assert reserve["battery"] > before["battery"]
         assert reserve["obstacle"] == before["obstacle"]
@@ -57,7 +57,7 @@ def test_unchanged_it_is_the_evaluation_of_training(
 ) -> None:
     folder = RunFolder.create(tmp_path / "run")
     summary = train(make_config(*TINY), folder)
-    deterministic = outcomes(folder, folder.load_config())["deterministic"]
+    deterministic = evaluation(folder, folder.load_config()).deterministic
     assert deterministic.return_mean == summary["evaluation"]["deterministic"]["return_mean"]
 
 

@@ -1,34 +1,24 @@
 """The report: verdicts and tables follow the records, and nothing is silently left out."""
 
-import dataclasses
+import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual.figures.canvas import save_png
-from experiments.paper import figures, intersections, statistics
-from experiments.paper.claims import AIMS, BASELINE_CLAIMS, FLOW_CLAIMS
-from experiments.paper.figures_flow import UNTRAINED
-from experiments.paper.hostile import HostileRun
-from experiments.paper.records import Outcome, Record
-from experiments.paper.report import Gathered, compose, gather, main, write_report
-from tests.paper.synthetic import make_record, make_records
+from experiments.paper import intersections, report
+from experiments.paper.claims import AIMS, BASELINE_CLAIMS, FLOW_CLAIMS, Evidence
+from experiments.paper.records import HostileRun, Record
+from experiments.paper.report import gather, judge, main, pages, write_report
+from experiments.paper.tables import in_words
+from tests.paper.synthetic import changed, hostile_run, make_evaluation, make_record, make_runs
+from tests.visual.conftest import is_a_picture
 
-HOSTILE = [HostileRun("exact", "calm", 1000, {"obstacle": 0, "battery": 0})]
+HOSTILE = {"exact": [hostile_run("exact")]}
+FIRST_AIM = len(FLOW_CLAIMS) + len(BASELINE_CLAIMS) + 1
 
-Change = Callable[[Record], Record]
-
-
-@pytest.fixture(autouse=True)
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    def save(figure: Figure, path: Path, *, dpi: int) -> Path:
-        return save_png(figure, path, dpi=35)
-
-    monkeypatch.setattr(figures, "save_png", save)
-    monkeypatch.setattr(statistics, "RESAMPLES", 200)
+pytestmark = pytest.mark.usefixtures("coarse")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -46,46 +36,18 @@ def few_intersections() -> Iterator[None]:
 
 
 def verdicts(
-    records: list[Record], hostile: list[HostileRun] | None = None
+    runs: Mapping[str, Sequence[Record]],
+    hostile: Mapping[str, Sequence[HostileRun]] = HOSTILE,
 ) -> dict[int, tuple[str, ...]]:
-    """Return the words in bold of each numbered row."""
-    tried = HOSTILE if hostile is None else hostile
-    text = compose(Gathered(records, [], tried, UNTRAINED))
-    rows = re.findall(r"^\| (\d+) \| (.*) \|$", text, flags=re.MULTILINE)
-    return {int(number): tuple(re.findall(r"\*\*(.*?)\*\*", row)) for number, row in rows}
-
-
-def broken(outcome: Outcome) -> Outcome:
-    return dataclasses.replace(outcome, violations={"obstacle": 1, "battery": 0})
-
-
-def break_evaluation(run: Record) -> Record:
-    worse = {**run.evaluation, "stochastic": broken(run.evaluation["stochastic"])}
-    return dataclasses.replace(run, evaluation=worse)
-
-
-def break_training(run: Record) -> Record:
-    return dataclasses.replace(run, training_violations={"obstacle": 1, "battery": 0})
-
-
-def break_afterwards(run: Record) -> Record:
-    after = {
-        change: {mode: broken(outcome) for mode, outcome in modes.items()}
-        for change, modes in run.afterwards.items()
+    """Return the words of each verdict by number, one for each flow that it is about."""
+    return {
+        each.number: tuple(each.verdict(flow).strip("*") for flow in each.found)
+        for each in judge(Evidence(runs, hostile))
     }
-    return dataclasses.replace(run, afterwards=after)
-
-
-def lower(run: Record) -> Record:
-    worse = {m: dataclasses.replace(o, score=o.score - 0.5) for m, o in run.evaluation.items()}
-    return dataclasses.replace(run, evaluation=worse)
-
-
-FIRST_AIM = len(FLOW_CLAIMS) + len(BASELINE_CLAIMS) + 1
 
 
 def test_verdicts_of_good_data() -> None:
-    found = verdicts(make_records(3))
+    found = verdicts(make_runs(3))
     assert len(found) == len(FLOW_CLAIMS) + len(BASELINE_CLAIMS) + len(AIMS)
     assert found[1] == ("not reproduced", "reproduced")
     assert found[3] == ("reproduced", "reproduced")
@@ -98,8 +60,24 @@ def test_verdicts_of_good_data() -> None:
     assert aims == [("met",), ("met",), ("met",), ("partly",), ("met",), ("met",)]
 
 
+def break_evaluation(run: Record) -> Record:
+    return changed(run, evaluation=make_evaluation(run.evaluation.stochastic.score, 1))
+
+
+def break_training(run: Record) -> Record:
+    return changed(run, training_violations={"obstacle": 1, "battery": 0})
+
+
+def break_afterwards(run: Record) -> Record:
+    return changed(run, afterwards=dict.fromkeys(run.afterwards, make_evaluation(1, 1)))
+
+
+def lower(run: Record) -> Record:
+    return changed(run, evaluation=make_evaluation(run.evaluation.stochastic.score - 0.5))
+
+
 @pytest.mark.parametrize(
-    ("change", "row", "verdict"),
+    ("change", "number", "verdict"),
     [
         (break_training, FIRST_AIM, ("partly",)),
         (break_evaluation, FIRST_AIM, ("partly",)),
@@ -109,60 +87,91 @@ def test_verdicts_of_good_data() -> None:
         (break_afterwards, FIRST_AIM + 5, ("not met",)),
     ],
 )
-def test_data_turn_the_verdict(change: Change, row: int, verdict: tuple[str, ...]) -> None:
-    records = make_records(3)
-    assert verdicts(records)[row] != verdict
-    worse = [change(run) if run.method == "exact" else run for run in records]
-    assert verdicts(worse)[row] == verdict
+def test_data_turn_the_verdict(
+    change: Callable[[Record], Record], number: int, verdict: tuple[str, ...]
+) -> None:
+    runs = make_runs(3)
+    assert verdicts(runs)[number] != verdict
+    assert verdicts({**runs, "exact": [change(run) for run in runs["exact"]]})[number] == verdict
 
 
 def test_one_violation_of_a_hostile_network_turns_the_verdict() -> None:
-    violated = [*HOSTILE, HostileRun("exact", "wild", 1000, {"obstacle": 0, "battery": 1})]
-    found = {n: verdicts(make_records(2), h)[FIRST_AIM + 4] for n, h in enumerate((violated, []))}
-    assert found == {0: ("not met",), 1: ("not tested",)}
+    violated = {"exact": [*HOSTILE["exact"], hostile_run("exact", 1)]}
+    assert verdicts(make_runs(2), violated)[FIRST_AIM + 4] == ("not met",)
+    assert verdicts(make_runs(2), {})[FIRST_AIM + 4] == ("not tested",)
 
 
 @pytest.mark.parametrize("method", ["squash", "projection", "penalty", "lagrangian"])
 def test_a_missing_baseline_leaves_the_aim_untested(method: str) -> None:
-    records = [run for run in make_records(2) if run.method != method]
-    assert verdicts(records)[FIRST_AIM + 1] == ("not tested",)
+    runs = {name: each for name, each in make_runs(2).items() if name != method}
+    assert verdicts(runs)[FIRST_AIM + 1] == ("not tested",)
 
 
 def left_out(text: str) -> str:
     return text.split("## What was left out")[1].split("\n## ")[0]
 
 
+def anchors(text: str) -> set[str]:
+    """Return the anchors that GitHub gives to headings."""
+    heads = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
 def test_report_is_written_and_repeated(tmp_path: Path) -> None:
-    for run in make_records(2, steps=5000):
-        run.save(tmp_path / "data")
-    path = write_report(tmp_path / "data", tmp_path / "data" / "..")
-    assert path.samefile(tmp_path / "README.md")
-    text = path.read_text()
-    shown = set(re.findall(r"\]\(images/(.*?)\)", text))
+    for runs in make_runs(2, steps=5000).values():
+        for run in runs:
+            run.save(tmp_path / "data")
+    assert write_report(tmp_path) == tmp_path / "README.md"
+    page, details = ((tmp_path / name).read_text() for name in ("README.md", "details.md"))
+    shown = set(re.findall(r"\]\(images/(.*?)\)", page))
     assert shown == {each.name for each in (tmp_path / "images").iterdir()}
-    assert str(tmp_path) not in text
-    assert left_out(text).strip() == "Nothing."
-    assert compose(gather(tmp_path / "data", tmp_path)) == text
+    assert all(is_a_picture(tmp_path / "images" / each) for each in shown)
+    assert set(re.findall(r"\(details\.md#(.*?)\)", page)) <= anchors(details)
+    assert set(re.findall(r"\(README\.md#(.*?)\)", details)) <= anchors(page)
+    assert str(tmp_path) not in page + details
+    assert left_out(details).strip() == "Nothing."
+    assert pages(gather(tmp_path)) == {"README.md": page, "details.md": details}
 
 
 def test_what_is_wrong_is_named_and_left_out(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    for run in [make_record("exact", seed) for seed in range(3)] + [make_record("squash", 0)]:
-        run.save(data)
+    for method, seed in (("exact", 0), ("exact", 1), ("exact", 2), ("squash", 0)):
+        make_record(method, seed).save(data)
     cut = data / "exact" / "seed_1.json"
     cut.write_text(cut.read_text()[:500])
     (data / "notes.txt").write_text("mine")
     (tmp_path / "policy.json").write_text("{}")
-    text = compose(gather(data, tmp_path, hostile=tmp_path / "gone.json"))
+    page, details = pages(gather(tmp_path, hostile=tmp_path / "gone.json")).values()
     for named in ("exact/seed_1.json", "notes.txt", "squash, seed 2", "gone.json", "policy.json"):
-        assert named in left_out(text)
-    assert "problems with the data" in text
-    assert "| exact flow (ours) | 2 |" in text
-    assert "standard normal" in text
-    assert str(tmp_path) not in text
+        assert named in left_out(details)
+    assert "problems with the data" in page
+    assert "| exact flow (ours) | 2 |" in details
+    assert "standard normal" in page
+    assert str(tmp_path) not in page + details
 
 
 def test_no_record_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--data", str(tmp_path / "unconstrained"), "--output", str(tmp_path)]) == 1
+    assert main([str(tmp_path)]) == 1
     assert "expected a record or more" in capsys.readouterr().err
-    assert not (tmp_path / "README.md").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_kept_page_is_that_of_the_kept_records() -> None:
+    """Every number of the first page's tables, without drawing or resampling much."""
+    kept = (report.HERE / "README.md").read_text()
+    found = pages(gather(report.HERE))["README.md"]
+    strip = re.compile(r" \[[−\d][^\]]*\]")
+    assert strip.sub("", found.split("## Training")[0]) == strip.sub(
+        "", kept.split("## Training")[0]
+    )
+
+
+def test_what_is_special_about_a_configuration_in_words() -> None:
+    special = {
+        "flow._target_": (json.dumps("package.Exact"), json.dumps("package.module.Other")),
+        "lr": ("0.1", None),
+        "penalty": ("null", None),
+        "penalty.penalty": (None, "100.0"),
+    }
+    assert in_words(special) == "`flow: Other`, `lr: absent`, `penalty.penalty: 100.0`"
+    assert in_words({}) == "nothing"

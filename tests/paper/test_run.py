@@ -1,229 +1,174 @@
-"""The runner: with the real trainer once, and with quick processes in its place."""
+"""The sweep: with the real trainer and few steps."""
 
-import io
-import os
-import signal
+import json
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper import run
-from experiments.paper.jobs import RunningJob
-from experiments.paper.plan import Job
-from experiments.paper.progress import Bars, Lines
-from experiments.paper.records import load_records
+from experiments.paper.records import Record, RecordError, load_records
+from experiments.paper.run import commit, do_run, settings
+from tests.training.conftest import TINY
 
+MakeConfig = Callable[..., DictConfig]
 ROOT = Path(__file__).resolve().parents[2]
-TINY = (
-    "training.warmup_frames=96",
-    "training.update_ratio=0.05",
-    "training.log_interval=64",
-    "evaluation.episodes=4",
-    "+env.base.max_steps=12",
-)
-GOOD = ["timeit", "-n1", "-r1", "pass"]
-BAD = ["json.tool", "no such file"]
-LONG = ["timeit", "-n1", "-r1", "import time; time.sleep(600)"]
+PAPER = ROOT / "experiments" / "paper"
 
 
-class Told:
-    """A display that remembers what was said."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.most = 0
-
-    def say(self, line: str) -> None:
-        self.lines.append(line)
-
-    def show(self, running: Sequence[RunningJob], finished: int, failed: int) -> None:
-        self.most = max(self.most, len(running))
-
-    def __enter__(self) -> "Told":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
+@pytest.fixture
+def config(make_config: MakeConfig) -> DictConfig:
+    return make_config(*TINY, "experiment=unconstrained", "seed=3", "logger=csv")
 
 
-def replace_commands(
-    monkeypatch: pytest.MonkeyPatch, train: dict[str, list[str]], collect: list[str] = GOOD
+def test_the_sweep_is_what_the_kept_records_show() -> None:
+    sweep = OmegaConf.load(PAPER / "sweep.yaml")
+    params = sweep.hydra.sweeper.params
+    records, _ = load_records(PAPER / "data")
+    assert {record.method for record in records} == set(params.experiment.split(","))
+    assert {str(record.seed) for record in records} == set(params.seed.split(","))
+    assert {record.steps for record in records} == {sweep.collector.total_frames}
+    known = {path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml")}
+    assert set(params.experiment.split(",")) <= known
+
+
+def test_a_run_is_done_once_and_its_record_says_what_it_left(
+    config: DictConfig, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(run, "PAUSE", 0.01)
-    monkeypatch.setattr(RunningJob, "_train", property(lambda self: train[self.job.method]))
-    monkeypatch.setattr(RunningJob, "_collect", property(lambda self: collect))
+    folder, data = tmp_path / "run", tmp_path / "data"
+    # What a killed run leaves is no run, and stays.
+    RunFolder.create(folder / "attempt_1").save_config(config)
+    assert do_run(config, "unconstrained", ["a=1"], folder, data).startswith("done, ")
+    (record,), problems = load_records(data)
+    assert problems == []
 
+    attempt = folder / "attempt_2"
+    assert sorted(each.name for each in folder.iterdir()) == ["attempt_1", "attempt_2"]
+    summary = json.loads((attempt / "summary.json").read_text())
+    assert (record.method, record.seed, record.steps) == ("unconstrained", 3, 192)
+    assert record.overrides == ("a=1",)
+    assert record.training_violations == summary["training_violations"]
+    assert record.violations == sum(summary["violations"].values()) > 0
+    assert record.evaluation.model_dump() == summary["evaluation"]
+    logged = read_scalars(attempt / "metrics")
+    assert set(record.curves) == set(logged)
+    for name, (steps, values) in logged.items():
+        assert record.curves[name].steps == tuple(steps)
+        assert record.curves[name].values == pytest.approx(tuple(values), rel=1e-5)
+    clock = record.curves["train/processor_seconds"]
+    assert clock.steps[-1] == 192
+    assert 0 < clock.values[0] <= clock.values[-1]
+    assert record.config == settings(RunFolder(attempt).load_settings())
+    assert not {"figures", "logger", "visual", "hydra"} & set(record.config)
+    assert {"python", "torch", "torchrl", "cnfp_torchrl"} <= set(record.versions)
 
-def test_a_failed_run_is_told_and_holds_up_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace_commands(monkeypatch, {"exact": GOOD, "penalty": BAD})
-    jobs = [Job(method, seed, 64) for seed in range(2) for method in ("penalty", "exact")]
-    told = Told()
-    failures = run.run_jobs(jobs, tmp_path, tmp_path / "data", parallel=2, progress=told)
-    log = tmp_path / "penalty" / "seed_0" / "output.log"
-    assert len(failures) == 2
-    assert f"penalty, seed 0: exit status 2, log in {log}" in failures
-    assert "no such file" in log.read_text()
-    assert told.most == 2
-    text = "\n".join(told.lines)
-    assert text.count(": done") == 2
-    assert text.count("FAILED") == 2
-    assert "no such file" in text
-
-
-def test_a_run_whose_record_fails_has_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace_commands(monkeypatch, {"exact": GOOD}, collect=BAD)
-    jobs = [Job("exact", 0, 64)]
-    (failure,) = run.run_jobs(jobs, tmp_path, tmp_path, parallel=1, progress=Told())
-    assert "exact, seed 0: exit status 2" in failure
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_stop_the_runs(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace_commands(monkeypatch, {"exact": LONG})
-    started = []
-    start = RunningJob._start
-
-    def remember(self: RunningJob, module: list[str]) -> subprocess.Popen[bytes]:
-        process = start(self, module)
-        started.append(process)
-        return process
-
-    monkeypatch.setattr(RunningJob, "_start", remember)
-
-    def interrupt() -> None:
-        while len(started) < 2:
-            time.sleep(0.01)
-        os.kill(os.getpid(), number)
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    jobs = [Job("exact", seed, 64) for seed in range(3)]
-    before = signal.getsignal(number)
-    with pytest.raises(run.Stopped, match=str(int(number))), run.signals_noted() as signals:
-        run.run_jobs(jobs, tmp_path, tmp_path, parallel=2, progress=Told(), signals=signals)
-    thread.join()
-    assert [process.poll() for process in started] == [-signal.SIGTERM] * 2
-    assert signal.getsignal(number) is before
-
-
-def test_two_commands_do_not_share_a_folder(tmp_path: Path) -> None:
-    with (
-        run.only_one(tmp_path),
-        pytest.raises(run.PlanError, match="expected a folder that nobody else uses"),
-        run.only_one(tmp_path),
-    ):
-        pass
-    with run.only_one(tmp_path):
-        pass
+    path = data / "unconstrained" / "seed_3.json"
+    assert len(path.read_bytes()) < 30_000
+    before = path.stat().st_mtime_ns
+    assert do_run(config, "unconstrained", ["a=1"], folder, data).startswith("done before")
+    assert path.stat().st_mtime_ns == before
+    # A finished run without a record is not repeated either.
+    path.unlink()
+    do_run(config, "unconstrained", ["a=1"], folder, data)
+    assert Record.read(path) == record
+    assert len(list(folder.iterdir())) == 2
+    # But one with another configuration is.
+    path.unlink()
+    config.optim.lr = 0.5
+    do_run(config, "unconstrained", [], folder, data)
+    assert len(list(folder.iterdir())) == 3
+    assert Record.read(path).config["optim"]["lr"] == 0.5
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("change", "named"),
     [
-        (["--seeds", "x"], "expected whole numbers and ranges such as 0,1,2 or 0-4, given 'x'"),
-        (["--seeds=-1"], "given '-1'"),
-        (["--parallel", "0"], "expected a whole number >= 1, given '0'"),
+        ({"collector": {"total_frames": 256}}, r"collector.total_frames \(192, asked for 256\)"),
+        ({"env": {"base": {"max_steps": 7}}}, r"env.base.max_steps \(12, asked for 7\)"),
     ],
 )
-def test_bad_options(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+def test_a_record_of_another_run_is_not_taken_for_it(
+    change: dict[str, object], named: str, config: DictConfig, tmp_path: Path
 ) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        run.main(arguments)
-    assert message in capsys.readouterr().err
+    do_run(config, "unconstrained", [], tmp_path / "run", tmp_path / "data")
+    other = OmegaConf.merge(config, change)
+    assert isinstance(other, DictConfig)
+    with pytest.raises(ValueError, match=named) as caught:
+        do_run(other, "unconstrained", [], tmp_path / "run", tmp_path / "data")
+    path = tmp_path / "data" / "unconstrained" / "seed_3.json"
+    assert str(path) in str(caught.value)
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(RecordError, match=r"seed_3\.json"):
+        do_run(config, "unconstrained", [], tmp_path / "run", tmp_path / "data")
 
 
-def test_a_bad_plan_starts_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "out"
-    assert run.main(["--methods", "exct", "--output", str(output)]) == 2
-    assert "given ['exct']" in capsys.readouterr().err
-    assert not output.exists()
+def test_a_run_without_a_method_is_refused(config: DictConfig, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="experiment: expected the name of a method"):
+        do_run(config, None, [], tmp_path / "run", tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_displays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_commit_is_known_only_in_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replace_commands(monkeypatch, {"exact": LONG})
-    job = RunningJob(Job("exact", 0, 400), tmp_path, tmp_path)
-    try:
-        assert job.steps == 0
-        log = job.folder / "metrics/scalars/train/seconds.csv"
-        log.parent.mkdir(parents=True)
-        log.write_text("64,1.0\n128,2.0\n")
-        assert job.steps == 128
-        lines = Lines(3, 400, pause=0)
-        lines.show([job], 1, 1)
-        assert capsys.readouterr().err == ("1 of 3 runs done, 1 FAILED; exact, seed 0 at 128\n")
-        stream = io.StringIO()
-        monkeypatch.setattr(sys, "stderr", stream)
-        with Bars(3, 400, 2) as bars:
-            bars.show([job], 1, 1)
-            assert "1 of 3 runs done, 1 FAILED" in stream.getvalue()
-            assert "928/1200" in stream.getvalue()
-            assert "exact, seed 0, training" in stream.getvalue()
-    finally:
-        job.ask_to_stop()
-        job.stop()
+    monkeypatch.setattr(run, "__file__", str(tmp_path / "run.py"))
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    assert commit() is None
+    git = ["git", "-c", "user.name=x", "-c", "user.email=x@y", "-C", str(tmp_path)]
+    subprocess.run([*git, "init", "-q"], check=True)
+    (tmp_path / "file").write_text("1")
+    subprocess.run([*git, "add", "file"], check=True)
+    subprocess.run([*git, "commit", "-q", "-m", "first"], check=True)
+    head = subprocess.run(
+        [*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True
+    ).stdout
+    clean = commit()
+    assert clean is not None
+    assert head.startswith(clean)
+    (tmp_path / "file").write_text("2")
+    assert commit() == f"{clean}-dirty"
+
+
+def sweep(output: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "experiments.paper.run", f"hydra.sweep.dir='{output}'"]
+    tiny = [each for each in TINY if not each.startswith("figures")]
+    return subprocess.run(
+        [*command, *tiny, *overrides], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+def test_an_unknown_method_starts_nothing(tmp_path: Path) -> None:
+    result = sweep(tmp_path / "out", "experiment=exact,exct")
+    assert result.returncode == 1
+    assert "exct" in result.stderr
+    assert not list(tmp_path.rglob("attempt_*"))
 
 
 @pytest.mark.slow
-def test_the_real_trainer_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "experiments.paper", "--methods", "exact,unconstrained"]
-    command += ["--seeds", "0", "--output", str(tmp_path / "a b=c"), "--no-report"]
-    command += ["--parallel", "2"]
-
-    def call(steps: int, *more: str) -> subprocess.CompletedProcess[str]:
-        arguments = [*command, "--steps", str(steps), *TINY, *more]
-        return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
-
-    first = call(192)
+def test_the_sweep_goes_on_where_it_was_and_past_failures(tmp_path: Path) -> None:
+    output = tmp_path / "a b=c"
+    first = sweep(output, "experiment=exact", "seed=0")
     assert first.returncode == 0, first.stderr
-    records, problems = load_records(tmp_path / "a b=c" / "data")
+    more = sweep(output, "experiment=exact", "seed=-1,0,1")
+    assert more.returncode == 1
+    assert "FAILED: exact, seed -1" in more.stdout
+    assert "exact, seed 0: done before" in more.stdout
+    records, problems = load_records(output / "data")
     assert problems == []
-    assert [record.method for record in records] == ["exact", "unconstrained"]
-    assert all(record.steps == 192 and record.curves["train/return"] for record in records)
-    exact, free = records
-    assert set(exact.violations.values()) == {0}
-    assert free.violations["obstacle"] > 0
-    for outcomes in exact.afterwards.values():
-        assert all(set(each.violations.values()) == {0} for each in outcomes.values())
-
-    again = call(192)
-    assert again.returncode == 0
-    assert "2 of them done before" in again.stderr
-    assert "started" not in again.stderr
-
-    (tmp_path / "a b=c" / "data" / "exact" / "seed_0.json").unlink()
-    collected = call(192)
-    assert collected.returncode == 0
-    assert load_records(tmp_path / "a b=c" / "data")[0][0].evaluation == exact.evaluation
-    assert len(list((tmp_path / "a b=c" / "runs" / "exact").iterdir())) == 1
-
-    other = call(256)
-    assert other.returncode == 2
-    assert "collector.total_frames (192, asked for 256)" in other.stderr
+    assert [(record.method, record.seed) for record in records] == [("exact", 0), ("exact", 1)]
+    assert all(record.violations == 0 for record in records)
+    assert "192/192" in (output / "runs" / "exact" / "seed_1" / "output.log").read_text()
 
 
 @pytest.mark.slow
 def test_a_diverged_run_is_no_record(tmp_path: Path) -> None:
-    arguments = ["--methods", "exact", "--seeds", "0", "--steps", "192", "--no-report"]
     diverging = ["training.update_ratio=1", "optim.lr=1e30"]
-    command = [sys.executable, "-m", "experiments.paper", *arguments, "--output", str(tmp_path)]
-    result = subprocess.run(
-        [*command, *TINY, *diverging], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    result = sweep(tmp_path, "experiment=exact", "seed=0", *diverging)
     assert result.returncode == 1
-    assert "FAILED: exact, seed 0" in result.stderr
-    assert "nan" in result.stderr
+    assert "nan" in result.stdout
     assert not (tmp_path / "data").exists()

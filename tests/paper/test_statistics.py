@@ -1,4 +1,3 @@
-import dataclasses
 import itertools
 
 import numpy as np
@@ -6,25 +5,26 @@ import pytest
 
 from experiments.paper.records import Record, Series
 from experiments.paper.statistics import (
+    Interval,
     area_under_score,
     band,
-    by_method,
     difference,
     interquartile_mean,
     reached,
-    round_ends,
     score_curve,
-    summarise,
-    total_violations,
+    violation_rate,
     violations_per_episode,
 )
-from tests.paper.synthetic import make_outcome, make_record, make_records
+from tests.paper.synthetic import CONSTRAINTS, changed, make_record
 
 
 def with_curves(record: Record, **curves: tuple[list[int], list[float]]) -> Record:
     """Return the record with curves given as ``train_return=(steps, values)``."""
-    new = {name.replace("_", "/", 1): Series(tuple(s), tuple(v)) for name, (s, v) in curves.items()}
-    return dataclasses.replace(record, curves={**record.curves, **new})
+    new = {
+        name.replace("_", "/", 1): Series(steps=tuple(steps), values=tuple(values))
+        for name, (steps, values) in curves.items()
+    }
+    return changed(record, curves={**record.curves, **new})
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,8 @@ def test_runs_that_agree_have_an_interval_without_width() -> None:
 
 def test_one_run_has_no_interval() -> None:
     interval = interquartile_mean([2.0])
-    assert (interval.low, interval.high, interval.runs) == (None, None, 1)
+    assert interval == (2.0, 2.0, 2.0, 1)
+    assert interval.text() == "2.00 (one run)"
 
 
 def test_no_runs_are_refused() -> None:
@@ -77,7 +78,7 @@ def test_a_difference_draws_both_methods_apart() -> None:
 
 
 def test_a_band_is_the_interval_at_each_entry() -> None:
-    runs = [Series((10, 20), (float(i), float(i * i))) for i in range(5)]
+    runs = [Series(steps=(10, 20), values=(float(i), float(i * i))) for i in range(5)]
     result = band(runs)
     assert result.steps.tolist() == [10, 20]
     for entry, values in enumerate([[0, 1, 2, 3, 4], [0, 1, 4, 9, 16]]):
@@ -89,7 +90,7 @@ def test_a_band_is_the_interval_at_each_entry() -> None:
 
 def test_a_band_needs_one_grid() -> None:
     with pytest.raises(ValueError, match="entries at the same steps"):
-        band([Series((10,), (0.0,)), Series((11,), (0.0,))])
+        band([Series(steps=(10,), values=(0.0,)), Series(steps=(11,), values=(0.0,))])
     with pytest.raises(ValueError, match="expected one or more"):
         band([])
 
@@ -105,12 +106,9 @@ def test_the_moment_of_a_score() -> None:
     record = with_curves(
         make_record(),
         train_return=([100, 200, 400], [-104.0, 14.0, -45.0]),
-        train_seconds=([100, 300], [5.0, 25.0]),
         train_processor_seconds=([100, 300], [4.0, 8.0]),
     )
-    moment = reached(record, 0.75)
-    assert moment is not None
-    assert (moment.steps, moment.seconds, moment.processor_seconds) == (200, 15.0, 6.0)
+    assert reached(record, 0.75) == (200, 6.0)
     first = reached(record, 0.0)
     assert first is not None
     assert first.steps == 100
@@ -126,7 +124,7 @@ def test_violations_at_start_and_end() -> None:
         violations_obstacle=(steps, [10.0, 32.0, 40.0, 50.0, 50.0, 54.0, 90.0]),
         violations_battery=(steps, [0.0, 16.0, 99.0, 99.0, 99.0, 103.0, 103.0]),
     )
-    assert round_ends(record) == [1600 * i for i in range(1, 13)]
+    assert violation_rate(record, "obstacle").steps == tuple(800 + 1600 * i for i in range(12))
     start, end = violations_per_episode(record)
     assert start == pytest.approx((32 + 16) / 16)
     assert end == pytest.approx((4 + 4) / 16)
@@ -138,33 +136,22 @@ def test_a_run_shorter_than_an_episode_is_one_window() -> None:
         violations_obstacle=([400, 800], [4.0, 12.0]),
         violations_battery=([400, 800], [0.0, 4.0]),
     )
-    assert round_ends(record) == [800]
+    assert violation_rate(record, "obstacle").steps == (400,)
     assert violations_per_episode(record) == pytest.approx((2.0, 2.0))
 
 
-def test_totals() -> None:
-    outcomes = {"stochastic": make_outcome(1, 2), "deterministic": make_outcome(1, 3)}
-    record = dataclasses.replace(
-        make_record(), evaluation=outcomes, training_violations={"obstacle": 7, "battery": 1}
-    )
-    assert total_violations(record) == 7 + 1 + 2 * (2 + 3)
+def test_violations_per_episode_add_up() -> None:
+    record = make_record("penalty", rate=0.1)
+    rates = violation_rate(record, CONSTRAINTS[0])
+    curve = record.curves[f"violations/{CONSTRAINTS[0]}"]
+    # Twelve whole rounds of 16 episodes.
+    total = np.interp(19_200, curve.steps, curve.values)
+    assert len(rates.values) == 12
+    assert sum(rates.values) * 16 == pytest.approx(total)
 
 
-def test_a_summary_does_not_leave_slow_runs_out() -> None:
-    good = [make_record(seed=seed) for seed in range(3)]
-    never = dataclasses.replace(make_record(seed=3, score=0.2))
-    whole, part = summarise(good), summarise([*good, never])
-    assert whole.reached == len(good)
-    assert whole.steps_to_score is not None
-    assert whole.steps_to_score.runs == 3
-    assert part.reached == 3
-    assert (part.steps_to_score, part.seconds_to_score) == (None, None)
-    assert part.seeds == (0, 1, 2, 3)
-
-
-def test_a_summary_is_of_one_method() -> None:
-    with pytest.raises(ValueError, match=r"given \['exact', 'squash'\]"):
-        summarise([make_record("exact"), make_record("squash")])
-    grouped = by_method(make_records(seeds=2))
-    assert {len(runs) for runs in grouped.values()} == {2}
-    assert [summarise(runs).method for runs in grouped.values()] == list(grouped)
+def test_intervals_in_words() -> None:
+    assert Interval(-0.5, -1000.25, 0.0, 3).text() == "−0.50 [−1,000.25, 0.00]"
+    assert Interval(2000.4, 1.0, 3.0, 3).text(0) == "2,000 [1, 3]"
+    assert Interval(0.0, 0.0, 0.0, 3).text() == "0"
+    assert Interval(1.5, 1.5, 1.5, 3).text() == "1.50"

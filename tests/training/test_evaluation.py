@@ -7,9 +7,9 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 
+from cnfp_torchrl.commands.evaluate import evaluation_table
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
-from cnfp_torchrl.training.evaluate import evaluate_run, table
-from cnfp_torchrl.training.evaluation import LinearScore, evaluate
+from cnfp_torchrl.training.evaluation import LinearScore, evaluate, evaluate_run
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 
@@ -94,7 +94,7 @@ def test_report_of_a_run(tiny_run: Callable[..., tuple[RunFolder, Any]]) -> None
         assert trained["return_mean"] == pytest.approx(result["return_mean"])
     for name in ("safe random", "shortest path"):
         assert reports[name]["violations"] == {"obstacle": 0, "battery": 0}
-    lines = table(reports).splitlines()
+    lines = evaluation_table(reports).splitlines()
     assert len(lines) == 6
     assert f"{trained['score']:.3f}" in lines[2]
 

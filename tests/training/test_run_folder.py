@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 import torch
-from cnfp_torchrl.visual.canvas import save_png
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from cnfp_torchrl.training.agent import build_actor, build_environment, load_actor
 from cnfp_torchrl.training.run_folder import CHECKPOINT, CONFIG, SUMMARY, RunFolder
+from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
 
 
@@ -234,3 +234,18 @@ def test_missing_sections_are_named(missing: str, tmp_path: Path) -> None:
     OmegaConf.save({k: v for k, v in SECTIONS.items() if k != missing}, tmp_path / CONFIG)
     with pytest.raises(ValueError, match=missing):
         RunFolder(tmp_path).load_config()
+
+
+OLD: dict[str, Any] = {
+    "env": {"layout": {"_target_": "cnfp_torchrl.envs.Layout"}},
+    "flow": {"order": ["a"], "combine": {"_target_": "cnfp_torchrl.modules.ExactFlow"}},
+    "network": {},
+}
+
+
+@pytest.mark.parametrize("trusted", [(), ("",)])
+def test_a_run_of_version_0_1_is_refused_as_such(trusted: tuple[str, ...], tmp_path: Path) -> None:
+    OmegaConf.save(OLD, tmp_path / CONFIG)
+    with pytest.raises(ValueError, match=r"config\.yaml: .*version 0\.1.*train"):
+        RunFolder(tmp_path).load_config(trusted)
+    assert RunFolder(tmp_path).load_settings() == OLD

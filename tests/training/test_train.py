@@ -65,7 +65,7 @@ def test_violations_are_those_the_environment_counts(
 def test_the_order_is_that_of_the_environments_geometry(tiny_run: Run) -> None:
     assert tiny_run()[1]["order"] == ["battery", "obstacle"]
     assert tiny_run("~env.geometry.battery")[1]["order"] == ["obstacle"]
-    assert tiny_run("flow.order=[obstacle,battery]")[1]["order"] == ["obstacle", "battery"]
+    assert tiny_run("env.order=[obstacle,battery]")[1]["order"] == ["obstacle", "battery"]
 
 
 def test_training_changes_actor_critic_and_temperature(tiny_run: Run) -> None:
@@ -111,16 +111,12 @@ def test_no_logger_is_fine(tiny_run: Run) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("flow.order=[battery]", r"order: expected each of the constraints .* given \['battery'\]"),
-        ("flow.order=[battery,obstacle,wind]", "wind"),
+        ("env.order=[battery]", r"order: expected each of the constraints .* given \['battery'\]"),
+        ("env.order=[battery,obstacle,wind]", "wind"),
         ("loss.entropy=maximal", "'reference' or 'action', given 'maximal'"),
         ("env.base.collision=bounce", "bounce"),
         ("env.layout.stations=[]", "stations"),
         ("env.geometry.battery.name=charge", "env.geometry.battery.name: expected 'battery'"),
-        (
-            "flow.obstacle=visble",
-            r"flow.obstacle: expected one of \['box', 'visible'\], given 'visble'",
-        ),
     ],
 )
 def test_bad_configuration_is_refused_before_anything_runs(
@@ -140,7 +136,9 @@ def test_bad_configuration_is_refused_before_anything_runs(
     assert not list(folder.path.iterdir())
 
 
-@pytest.mark.parametrize("override", ["flow=perfect", "flow.oder=[battery]", "sed=1"])
+@pytest.mark.parametrize(
+    "override", ["flow=perfect", "env/obstacle=visble", "env.oder=[battery]", "sed=1"]
+)
 def test_unknown_configuration_is_refused(
     override: str, make_config: Callable[..., DictConfig]
 ) -> None:

@@ -6,8 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
 from cnfp_torchrl.envs import TaskView
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
 from cnfp_torchrl.visual import FlowSnapshot
 from cnfp_torchrl.visual.explanation import ConstraintEffect, Explanation, explain
 from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_snapshot

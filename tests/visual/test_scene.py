@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.distributions import ConstrainedFlow
-from cnfp_torchrl.modules import ProjectionFlow, flow_head
 from cnfp_torchrl.envs import NOTHING, Map, TaskView
+from cnfp_torchrl.modules import ProjectionFlow, flow_head
 from cnfp_torchrl.visual import Scene, Setting
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.scene import PRINTED, Detail, base_density, density_limits

@@ -5,11 +5,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors
+from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors, find_task_view
 from cnfp_torchrl.geometry import Ball, Box, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import telling_states
 from cnfp_torchrl.visual.states import openness

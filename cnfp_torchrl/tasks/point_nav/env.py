@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cnfp_torchrl.envs import TaskView
 from cnfp_torchrl.tasks.point_nav.dynamics import (
     CONSTRAINT_NAMES,
     Collision,
@@ -19,7 +20,6 @@ from cnfp_torchrl.tasks.point_nav.dynamics import (
 )
 from cnfp_torchrl.tasks.point_nav.layout import EPISODE_STEPS, Layout
 from cnfp_torchrl.tasks.point_nav.task_view import PointNavView
-from cnfp_torchrl.envs import TaskView
 
 
 class PointNavEnv(EnvBase):
@@ -43,9 +43,9 @@ class PointNavEnv(EnvBase):
         layout: the map; None takes the reference task.
         collision: ``pass``, the agent goes on through an obstacle and is clipped at the walls, or
             ``block``, it stays where it is; both are counted.
-        max_steps: an episode is truncated after this many steps.
-        device: where it computes.
-        seed: of starts and goals; None takes one from torch's global generator.
+        max_steps: length at which an episode is truncated.
+        device: the device to compute on.
+        seed: seed of starts and goals; None takes one from torch's global generator.
 
     Raises:
         ValueError: for a bad argument, a start state outside the arena, and for an action with NaN

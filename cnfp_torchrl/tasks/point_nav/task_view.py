@@ -12,7 +12,16 @@ from torch import Tensor
 from torch.linalg import vector_norm
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import appended_transforms
+from cnfp_torchrl.envs import (
+    Boxes,
+    Discs,
+    Map,
+    Marks,
+    Polyline,
+    Series,
+    TaskView,
+    appended_transforms,
+)
 from cnfp_torchrl.tasks.point_nav.geometry import (
     BatteryGeometry,
     PointNavGeometry,
@@ -20,7 +29,6 @@ from cnfp_torchrl.tasks.point_nav.geometry import (
 )
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import ShortestPath, side_distances
-from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Series, TaskView
 
 _CANDIDATES = 1024
 _MOST_RESETS = 64

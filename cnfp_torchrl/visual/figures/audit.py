@@ -14,13 +14,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from cnfp_torchrl.audit.report import (
+from cnfp_torchrl.audit import (
     TOGETHER,
     AuditReport,
-    Findings,
+    ConstraintMetrics,
     Quantiles,
-    Scene,
     Share,
+    WorstState,
 )
 from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
 from cnfp_torchrl.visual.figures.canvas import house_style, new_figure, save_png
@@ -51,7 +51,7 @@ def audit_figure(report: AuditReport) -> Figure:
         report: of `cnfp_torchrl.audit.audit`.
     """
     colors = constraint_colors(report.order) | {TOGETHER: INK}
-    scenes = [scene for scene in report.scenes if scene.actions.shape[-1] == 2][:_MOST_SCENES]
+    scenes = [scene for scene in report.worst_states if scene.actions.shape[-1] == 2][:_MOST_SCENES]
     with house_style():
         figure = new_figure(13.0, 7.4 if scenes else 3.4)
         verdict = f"{len(report.flaws)} flaws" if report.flaws else "no flaw found"
@@ -101,7 +101,13 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[s
 
 
 def _draw_findings(
-    panels: Sequence[Axes], found: Findings, at: float, height: float, color: str, *, faint: bool
+    panels: Sequence[Axes],
+    found: ConstraintMetrics,
+    at: float,
+    height: float,
+    color: str,
+    *,
+    faint: bool,
 ) -> None:
     shares = (found.unsound, found.coverage, found.dropped)
     for axes, share in zip(panels, shares, strict=False):
@@ -149,7 +155,9 @@ def _draw_spread(
     axes.plot(middle, at, "D", color="white", mec=INK, mew=0.8, markersize=4, zorder=3)
 
 
-def _draw_scene(axes: Axes, scene: Scene, order: Sequence[str], colors: Mapping[str, str]) -> None:
+def _draw_scene(
+    axes: Axes, scene: WorstState, order: Sequence[str], colors: Mapping[str, str]
+) -> None:
     x, y = scene.actions.T.numpy()
     for depth, (mask, mark) in enumerate(zip(_kinds(scene), _MARKS.values(), strict=True)):
         axes.plot(x[mask], y[mask], linestyle="none", zorder=2 if depth < 3 else 7, **mark)
@@ -170,11 +178,12 @@ def _draw_scene(axes: Axes, scene: Scene, order: Sequence[str], colors: Mapping[
     axes.set_xlabel("$a_1$")
     axes.set_ylabel("$a_2$")
     axes.set_title(
-        f"worst for {scene.name}, {scene.source}: {scene.why}\n{_told(scene.state)}", fontsize=8.5
+        f"worst for {scene.name}, {scene.source}: {scene.reason}\n{_told(scene.state)}",
+        fontsize=8.5,
     )
 
 
-def _kinds(scene: Scene) -> list[NDArray[np.bool_]]:
+def _kinds(scene: WorstState) -> list[NDArray[np.bool_]]:
     """Return masks of the actions of each kind, in the order of `_MARKS`."""
     inside, bad, dead = (x.numpy() for x in (scene.inside, scene.violates, scene.dead_end))
     return [bad & ~inside, ~bad & ~inside, ~bad & inside & ~dead, dead, bad & inside]

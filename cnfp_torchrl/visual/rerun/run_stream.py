@@ -56,7 +56,7 @@ class RunStream:
         self._samples = samples
         self._projections = projections
 
-    def of_training(
+    def for_training(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
     ) -> TrainingStream:
         """Return the stream of a training run into a file.
@@ -71,7 +71,7 @@ class RunStream:
 
         return TrainingStream(recording, self._stream(recording, actor, env, self.every), episodes)
 
-    def of_episodes(
+    def for_evaluation(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
     ) -> EvaluationStream:
         """Return the stream of episodes into a file.
@@ -161,15 +161,15 @@ class TrainingStream:
         self, recording: Recording, stream: FlowStream, episodes: Callable[[int], EpisodeStream]
     ) -> None:
         self.loggers = [_SeededLogger("recording", stream=recording.stream)]
-        self.see = StreamHook(stream)
+        self.on_batch = StreamHook(stream)
         self._recording = recording
         self._make_episodes = episodes
         self._episodes: EpisodeStream | None = None
 
-    def see_episode(self, episode: Sequence[TensorDictBase]) -> None:
+    def on_episode(self, episode: Sequence[TensorDictBase]) -> None:
         """Stream the transitions of an episode, behind all that was seen before."""
         if self._episodes is None:
-            self._episodes = self._make_episodes(self.see.frames)
+            self._episodes = self._make_episodes(self.on_batch.frames)
         self._episodes(episode)
 
     def close(self) -> None:
@@ -187,7 +187,7 @@ class EvaluationStream:
 
     def __init__(self, recording: Recording, episodes: EpisodeStream) -> None:
         self._recording = recording
-        self.see = episodes
+        self.on_episode = episodes
 
     def close(self) -> None:
         """Finish the recording, when whoever looks at it has seen enough."""

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
+from cnfp_torchrl.envs.task_view import Boxes, Map, find_task_view
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.envs import Boxes, Map, find_task_view
 
 
 def told(position: list[float], battery: int, layout: Layout | None = None) -> tuple[str, dict]:

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tensordict.nn import TensorDictModule
 
-from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv
 from cnfp_torchrl.envs import Map, TaskView, find_task_view
+from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv
 from cnfp_torchrl.visual import constraint_colors
 from cnfp_torchrl.visual.figures import Episode, record_episodes, trajectories
 

@@ -1,0 +1,62 @@
+"""Evaluate a trained run beside policies that learn nothing: the command ``cnfp-evaluate``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
+from pathlib import Path
+from typing import Any
+
+from cnfp_torchrl.commands.extras import needs_extra
+
+with needs_extra("train"):
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.utils import instantiate
+    from omegaconf import DictConfig
+
+    from cnfp_torchrl.configuration import config_directory, require_settings
+    from cnfp_torchrl.text_table import text_table
+    from cnfp_torchrl.training.callbacks import RECORDING, CallbackFactory, show_episodes
+    from cnfp_torchrl.training.evaluation import evaluate_run
+    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.settings import EvaluationSettings
+    from cnfp_torchrl.whole_file import write_json
+
+
+def evaluation_table(reports: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the reports of `evaluate_run` as a text table."""
+    names = list(next(iter(reports.values()))["violations"])
+    rows = [["policy", "return", "score", *(f"{name} violations" for name in names)]]
+    for policy, report in reports.items():
+        error = report["return_standard_error"]
+        spread = "" if error is None else f" +- {error:.2f}"
+        score = "-" if report["score"] is None else f"{report['score']:.3f}"
+        counts = [str(report["violations"][name]) for name in names]
+        rows.append([policy, f"{report['return_mean']:.2f}{spread}", score, *counts])
+    return text_table(rows)
+
+
+@hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""
+    require_settings(config)
+    settings: EvaluationSettings = instantiate(config.evaluation)
+    visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
+    trusted = tuple(config.trusted)
+    folder = RunFolder.open(config.run)
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    shown: AbstractContextManager[Any] = nullcontext()
+    if visual is not None:
+        recording = directory / RECORDING
+        shown = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
+    with shown:
+        reports = evaluate_run(folder, settings, trusted=trusted)
+        output = directory / "evaluation.json"
+        write_json(output, {"run": str(folder.path), "seed": settings.seed, "policies": reports})
+        sys.stdout.write(f"{evaluation_table(reports)}\n{output}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,6 @@
+"""Configurations: where the shipped ones are, what settings may be, what a run's may name."""
+
+from cnfp_torchrl.configuration.directory import config_directory
+from cnfp_torchrl.configuration.settings import require_fields, require_setting, require_settings
+
+__all__ = ["config_directory", "require_fields", "require_setting", "require_settings"]

@@ -1,0 +1,157 @@
+r"""The lexicographic rule: which sets hold, by how much the others give way, and the anchor.
+
+For k from the highest priority down, with a depth :math:`h_k` that every set keeps
+(`cnfp_torchrl.geometry.anchor.depth`),
+
+.. math:: S = \{a : slack_j(a) \ge h_j - \rho_j \text{ for the bounds and all } j > k\}, \quad
+          \rho_k = \min_{a \in S} \max(0, h_k - slack_k(a)).
+
+This is hierarchical optimization as known from robot control (Kanoun et al. 2011, Escande et al.
+2014). Because the minimum is taken over S and not over the region itself, room of depth h is left
+however many sets give way. The rows of one set are relaxed one by one, by lexicographic minimax:
+the rows that keep the smallest slack from growing give way, then the others are decided without
+them, so that one impossible row loosens no other row that can hold beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry.anchor.attempts import first_attempt, refined_attempt
+from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
+from cnfp_torchrl.geometry.anchor.interior_point import Best
+from cnfp_torchrl.geometry.anchor.intersection import Intersection
+from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+
+LEEWAY = 1e-3
+"""By how much relaxed rows give way beyond the least amount, as a share of the bounds' width.
+
+A region only as wide as the depth would leave a policy no room. In relaxed states of 2 and 6
+dimensions, from 1e-5 to 1e-2, the gradient of the log-density in the latent stays the same (medians
+1.7 and 4.4: it depends on directions alone), but each factor of ten makes the action's gradient ten
+times larger and the log-density, which the entropy weight must make up for, d log(10) smaller. At
+1e-3 a relaxed state's actions lie within about a thousandth of the bounds' width of the best ones,
+the log-density is some 8 d above that of the bounds, and float32's rounding is a thousandth of what
+is left.
+"""
+
+
+@torch.no_grad()
+def lexicographic_anchor(
+    sets: Sequence[ConstraintSet], candidate: Tensor | None = None, leeway: float = LEEWAY
+) -> Anchored:
+    """Find which sets hold in each state, by how much others give way, and the anchor.
+
+    Cheap attempts first (`attempt_anchor`); the certified search takes the states that they leave
+    undecided. A function of the states alone: of batches it does not depend what is found.
+
+    A convex set is relaxed only on a certified upper bound of its slack, by an amount within 2 % of
+    its depth of the least one, plus the leeway. Of non-convex sets convex parts are tried: those of
+    the most room, those near points that all convex sets have in common, and those near a point of
+    what is kept so far.
+
+    Args:
+        sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
+            which always holds, and the last has the highest priority.
+        candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
+        leeway: by how much relaxed rows give way beyond the least amount, as a share of the bounds'
+            smallest width; positive.
+
+    Raises:
+        ValueError: when the leeway is not positive.
+        GeometryError: when ``sets[0]`` is no box; where a search is needed, also when it is
+            unbounded or a field has NaN in it.
+    """
+    if not leeway > 0:
+        raise ValueError(f"leeway: expected a number > 0, given {leeway}")
+    bounds = bounds_of(sets)
+    depths = row_depths(sets)
+    found = first_attempt(sets, depths, candidate)
+    shape, dim = found.decided.shape, found.anchor.shape[-1]
+    anchor = found.anchor.reshape(-1, dim)
+    active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
+    relaxation = [each.new_zeros(*shape, each.shape[-1]) for each in depths]
+    left = (~found.decided).flatten().nonzero().squeeze(-1)
+    if len(left):
+        # Steps inwards for the states that need them, and the search for those that need more.
+        sets = [each.select(shape, left) for each in sets]
+        depths = [_flat(each, shape)[left] for each in depths]
+        found = refined_attempt(sets, depths, found.select(left))
+        anchor = anchor.index_copy(0, left, found.anchor)
+        hard = (~found.decided).nonzero().squeeze(-1)
+        sets = [each.select(found.decided.shape, hard) for each in sets]
+        depths = [each[hard] for each in depths]
+        found, left = found.select(hard), left[hard]
+    if len(left):
+        margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
+        searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.upper)
+        # Beside sets 1e15 times further away than the bounds are wide, the search's own rounding
+        # may have left the bounds; those sets are relaxed by so much that nothing else changes.
+        above, below = depths[0].chunk(2, -1)
+        limits = sets[0].bounding_box()
+        point = searched.anchor.clamp(limits.low + below, limits.high - above)
+        anchor = anchor.index_copy(0, left, point.to(anchor))
+        active.view(-1, len(sets)).index_copy_(0, left, searched.active)
+        # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
+        up = 1 + 4 * torch.finfo(anchor.dtype).eps
+        for each, rows in zip(relaxation, (up * rows for rows in searched.relaxation), strict=True):
+            each.view(-1, each.shape[-1]).index_copy_(0, left, rows.to(each))
+    return Anchored(anchor.view(*shape, dim), active, tuple(relaxation))
+
+
+def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:
+    """Return the relaxation that a set has where it can just be touched, ``(*batch, K + 1)``.
+
+    An equality stated as two half-spaces, a point, a bound of 0: sets without interior are relaxed
+    by this much at most, and no action need leave them by more than that. A larger relaxation says
+    that a constraint could not be had.
+
+    Args:
+        sets: as in `lexicographic_anchor`.
+        leeway: the same.
+    """
+    more = leeway * smallest_width(bounds_of(sets))
+    floors = [(1 + 2 * PRECISION) * each.amax(-1) + more for each in row_depths(sets)]
+    return torch.stack(torch.broadcast_tensors(*floors), -1)
+
+
+def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
+    """Find points whose smallest slack in all sets is a large share of the best one.
+
+    A batched interior-point method in float64. A set that does not describe its `superlevel` is
+    cut out by linearizations of its slack, which takes longer. Of a non-convex set a convex part
+    counts.
+
+    Args:
+        sets: sets of batch shape ``(B,)``, the first a finite box.
+        share: the share of the best slack that will do, below 1; where the best slack is negative
+            the one found is at most that much lower.
+
+    Returns:
+        Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
+
+    Raises:
+        GeometryError: when the first set is no finite box, or a field has NaN in it.
+    """
+    everything = Intersection.of(sets)
+    middle = (everything.bounds.low + everything.bounds.high) / 2
+    rows = torch.ones_like(everything.row_slacks(middle), dtype=torch.bool)
+    width = smallest_width(everything.bounds)
+
+    def settled(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
+        gap, decided = upper - lower, (lower > 0) | (upper < 0)
+        close = gap <= (1 - share) * torch.maximum(upper, -lower)
+        return (decided & close) | (gap <= 1e-9 * width[index])
+
+    return everything.maximize(
+        torch.zeros_like(rows, dtype=middle.dtype), rows, rows, middle, settled
+    )
+
+
+def _flat(rows: Tensor, shape: torch.Size) -> Tensor:
+    """Return values ``(*batch, m)`` of all batch elements, ``(B, m)``."""
+    return rows.expand(*shape, rows.shape[-1]).reshape(-1, rows.shape[-1])

@@ -1,0 +1,38 @@
+"""Exploration that would break constraints, refused by type."""
+
+from __future__ import annotations
+
+from torch import nn
+from torchrl.modules import (
+    AdditiveGaussianModule,
+    EGreedyModule,
+    OrnsteinUhlenbeckProcessModule,
+)
+
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+
+EXPLORATION = (AdditiveGaussianModule, EGreedyModule, OrnsteinUhlenbeckProcessModule)
+"""TorchRL's modules that change an action after it was chosen."""
+
+
+def refuse_exploration(policy: nn.Module) -> None:
+    """Refuse a policy that changes actions of a constrained flow by exploration of TorchRL's own.
+
+    Such noise knows the action bounds, not the constraints. On the latent, before a `FlowMap`, it
+    is carried to allowed actions and may stay.
+
+    Args:
+        policy: A policy, such as a sequence of a constrained actor and further modules.
+
+    Raises:
+        TypeError: naming the exploration module and what to do.
+    """
+    flows = (each for each in policy.modules() if isinstance(each, ConstrainedFlowModule))
+    actions = [flow.action_key for flow in flows]
+    for module in policy.modules():
+        if isinstance(module, EXPLORATION) and any(key in actions for key in module.out_keys):
+            raise TypeError(
+                f"policy: expected no {type(module).__name__} on constrained actions, which its "
+                "noise would take out of their sets; a flow explores by its own Gaussian, and "
+                "noise of other kinds belongs on the latent, before a FlowMap"
+            )

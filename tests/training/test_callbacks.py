@@ -1,0 +1,311 @@
+"""``visual=...`` of the commands: what is recorded, and what it changes in the run: nothing."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import rerun_cli
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rerun.chunk import RrdReader
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from cnfp_torchrl.modules import guarded
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.callbacks import EpisodeRecorder, replay_episodes, show_episodes
+from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
+from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.train import train
+from cnfp_torchrl.visual.rerun import Recording, RunningViewer
+from tests.visual.rerun.recorded import read
+
+RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+FILE = ["visual=file", "visual.samples=16"]
+Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
+Config = Callable[..., DictConfig]
+
+
+def steps_of(path: Path, entity: str) -> list[int]:
+    """Return the steps at which an entity was logged."""
+    found: list[int] = []
+    for chunk in RrdReader(str(path)).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if "env_step" in batch.schema.names:
+            found += batch.column("env_step").to_pylist()
+    return sorted(found)
+
+
+def compare(one: RunFolder, other: RunFolder) -> int:
+    recordings = [str(folder.path / "recording.rrd") for folder in (one, other)]
+    return subprocess.run([RERUN, "rrd", "compare", *recordings], check=False).returncode
+
+
+OFF = """
+import sys
+from hydra import compose, initialize_config_dir
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.train import train
+import cnfp_torchrl.commands.evaluate
+with initialize_config_dir(str(config_directory()), version_base="1.3"):
+    train(compose("train", overrides=sys.argv[2:]), RunFolder.create(sys.argv[1]))
+assert "rerun" not in sys.modules
+assert "cnfp_torchrl.visual" not in sys.modules
+"""
+
+
+def test_off_imports_nothing(tmp_path: Path) -> None:
+    tiny = ["collector.total_frames=32", "training.warmup_frames=16", "training.update_ratio=0.1"]
+    tiny += ["evaluation.episodes=2", "+env.base.max_steps=4"]
+    done = subprocess.run(
+        [sys.executable, "-c", OFF, tmp_path / "run", *tiny, "logger=none"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.rglob("*.rrd"))
+
+
+def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run: Run) -> None:
+    folder, _ = tiny_run(*FILE, "collector.total_frames=400", "training.log_interval=160")
+    path = folder.path / "recording.rrd"
+    # 16 agents are stepped together: 25 steps of each. Then an evaluation episode of 12 steps.
+    assert steps_of(path, "/explanation") == [0, 160, 320, *range(400, 412)]
+    for name in ("violations/obstacle", "loss/qvalue", "loss/actor", "train/alpha"):
+        assert steps_of(path, f"/metrics/{name}") == [160, 320, 400], name
+
+
+@pytest.fixture
+def evaluated(monkeypatch: pytest.MonkeyPatch) -> dict[bool, list[list[TensorDictBase]]]:
+    """The first two episodes of a training's evaluations, by whether they are deterministic."""
+    episodes = {}
+
+    def spied(*given: Any, deterministic: bool, on_step: Callable, **options: Any) -> Evaluation:
+        kept = EpisodeRecorder(range(2))
+
+        def look(transition: TensorDictBase) -> None:
+            kept(transition)
+            if on_step is not None:
+                on_step(transition)
+
+        result = evaluate_seeded(*given, deterministic=deterministic, on_step=look, **options)
+        episodes[deterministic] = list(kept.episodes.values())
+        return result
+
+    monkeypatch.setattr("cnfp_torchrl.training.train.evaluate_seeded", spied)
+    return episodes
+
+
+@pytest.mark.parametrize("flow", ["exact", "squash", "unconstrained"])
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_final_evaluation_follows_the_training(
+    deterministic: bool,
+    flow: str,
+    tiny_run: Run,
+    evaluated: dict[bool, list[list[TensorDictBase]]],
+) -> None:
+    chosen = ["visual.episodes=2", f"visual.deterministic={deterministic}", f"flow={flow}"]
+    folder, _ = tiny_run(*FILE, *chosen)
+    path = folder.path / "recording.rrd"
+    steps = [step for episode in evaluated[deterministic] for step in episode]
+    behind = range(192, 192 + 24)
+    assert len(steps) == len(behind)
+    last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "unconstrained": "1\\ bounds"}[flow]
+    executed = read(path, f"/stages/{last}/executed", "Points2D:positions")
+    assert [step for step in executed if step >= 0] == [0, 160, *behind]
+    for number, step in zip(behind, steps, strict=True):
+        np.testing.assert_array_equal(executed[number][-1], step["action"].numpy())
+    # An episode's return begins anew, and so does the first one's, whatever the training left.
+    reward = torch.stack([step["next", "reward"].squeeze() for step in steps]).double()
+    returns = read(path, "/series/return", "Scalars:scalars")
+    expected = reward.reshape(2, 12).cumsum(1).reshape(-1)
+    np.testing.assert_allclose([returns[number].item() for number in behind], expected.numpy())
+    trail = read(path, "/map/trail", "LineStrips2D:strips")
+    assert [len(trail[number][-1]) for number in (192, 193, 204)] == [1, 2, 1]
+    words = {
+        number: text.item()
+        for number, text in read(path, "/explanation", "TextDocument:text").items()
+    }
+    policy = "deterministic" if deterministic else "stochastic"
+    for number, episode, step in ((192, 0, 0), (199, 0, 7), (215, 1, 11)):
+        head = f"Evaluation, episode {episode}, step {step} of 12, {policy} policy: **"
+        assert words[number].startswith(head)
+    assert words[160].startswith("**")
+
+
+def test_a_stream_that_fails_costs_no_results(
+    tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, expected = tiny_run()
+
+    def fail(*_: Any) -> None:
+        raise OSError("no stream")
+
+    monkeypatch.setattr("cnfp_torchrl.visual.rerun.run_stream.TrainingStream.on_episode", fail)
+    with pytest.raises(OSError, match="no stream"):
+        tiny_run(*FILE)
+    folder = RunFolder.open(tmp_path / "run1")
+    assert json.loads((folder.path / SUMMARY).read_text())["evaluation"] == expected["evaluation"]
+    assert steps_of(folder.path / "recording.rrd", "/explanation") == [0, 160]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_evaluation_that_fails_costs_neither_checkpoint_nor_recording(
+    error: type[BaseException], tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error("no evaluation")
+
+    closed = []
+    close = Recording.close
+
+    def spied(self: Recording) -> None:
+        closed.append(self.path)
+        close(self)
+
+    monkeypatch.setattr("cnfp_torchrl.training.train.evaluate_seeded", fail)
+    monkeypatch.setattr(Recording, "close", spied)
+    with pytest.raises(error, match="no evaluation"):
+        tiny_run(*FILE)
+    folder = RunFolder.open(tmp_path / "run0")
+    assert folder.load_checkpoint()["actor"]
+    assert closed == [folder.path / "recording.rrd"]
+    assert steps_of(closed[0], "/explanation") == [0, 160]
+
+
+def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run) -> None:
+    unwatched = tiny_run("training.warmup_frames=48")
+    one, other, different = (
+        tiny_run(*FILE, "training.warmup_frames=48", "visual.every=1", f"seed={seed}")
+        for seed in (0, 0, 1)
+    )
+    assert steps_of(one[0].path / "recording.rrd", "/explanation")[-12:] == list(range(192, 204))
+    for key in ("return_mean", "violations", "evaluation"):
+        assert one[1][key] == unwatched[1][key]
+    states = [folder.load_checkpoint()["loss"] for folder in (one[0], unwatched[0])]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+    assert compare(one[0], other[0]) == 0
+    assert compare(one[0], different[0]) != 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["visual=file", "visual.every=0"], "visual.every: expected a whole number >= 1, given 0"),
+        (["visual=file", "visual.episodes=0"], "visual.episodes: expected a whole number >= 1"),
+        (["visual=file", "visual.projections=[[0,7]]"], "projection"),
+        (["visual=spawn"], "visual=spawn: expected a display"),
+        (["visual=connect", "visual.viewer.url=rerun+http://127.0.0.1:1/proxy"], "found none"),
+        (
+            ["visual=serve", "visual.viewer.port=70000"],
+            "viewer.port: expected a port from 1 to 65535",
+        ),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_before_anything_is_left(
+    overrides: list[str],
+    message: str,
+    make_config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    folder = RunFolder.create(tmp_path / "run")
+    with pytest.raises(Exception, match=message):
+        train(make_config(*overrides), folder)
+    assert not list(folder.path.iterdir())
+
+
+def test_a_recording_is_never_overwritten(make_config: Config, tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / "recording.rrd").write_text("precious")
+    with pytest.raises(FileExistsError, match=r"recording\.rrd exists"):
+        train(make_config(*FILE), folder)
+    assert (folder.path / "recording.rrd").read_text() == "precious"
+
+
+@pytest.fixture
+def server() -> Iterator[psutil.Popen]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [RERUN, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)]
+    process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process.url = f"rerun+http://127.0.0.1:{port}/proxy"
+    while not RunningViewer(process.url).is_listening():
+        assert process.poll() is None
+        time.sleep(0.05)
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("fate", [None, signal.SIGSTOP, signal.SIGKILL])
+def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
+    fate: signal.Signals | None, server: psutil.Popen, tiny_run: Run, tmp_path: Path
+) -> None:
+    reference, summary = tiny_run(*FILE, "visual.every=1")
+
+    def strike() -> None:
+        while not list(tmp_path.glob("run1/recording.rrd")):
+            time.sleep(0.01)
+        server.send_signal(fate)
+
+    if fate is not None:
+        threading.Thread(target=strike).start()
+    live = ["visual=connect", f"visual.viewer.url={server.url}", "visual.samples=16"]
+    folder, watched = tiny_run(*live, "visual.every=1")
+    assert watched["return_mean"] == summary["return_mean"]
+    assert compare(folder, reference) == 0
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_replayed_episodes_are_those_of_the_evaluation(
+    deterministic: bool, tiny_run: Run, tmp_path: Path
+) -> None:
+    folder, _ = tiny_run()
+    config = folder.load_config()
+    settings = EvaluationSettings(episodes=5, seed=7)
+
+    def made() -> tuple[EnvBase, Any]:
+        env = build_environment(config, batch_size=[5], with_anchor=True)
+        return env, load_actor(folder, config, env)
+
+    env, actor = made()
+    expected = evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic).returns
+    episodes = replay_episodes(*made(), settings, [0, 3], deterministic)
+    for number, episode in zip((0, 3), episodes, strict=True):
+        assert len(episode) == 12
+        total = sum(float(step["next", "reward"]) for step in episode)
+        assert total == pytest.approx(float(expected[number]), rel=1e-5)
+
+    factory = instantiate({"_target_": "cnfp_torchrl.visual.rerun.RunStream", "episodes": 2})
+    path = tmp_path / "recording.rrd"
+    show_episodes(folder, settings, factory, path).close()
+    assert steps_of(path, "/explanation") == list(range(24))
+    words = read(path, "/explanation", "TextDocument:text")[19].item()
+    assert words.startswith("Evaluation, episode 1, step 7 of 12, stochastic policy: **")
+
+
+def test_episodes_of_an_environment_without_batch_follow_each_other() -> None:
+    kept = EpisodeRecorder([1])
+    for step, done in enumerate([False, True, False, False, True, True]):
+        kept(TensorDict({"step": step, "next": {"done": torch.tensor([done])}}, []))
+    assert [int(each["step"]) for each in kept.episodes[1]] == [2, 3, 4]
