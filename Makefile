@@ -62,7 +62,7 @@ figures: $(STAMP) ## Redraw the figures and pages of the kept records in experim
 # A reference that leads nowhere, a formula that cannot be set, a page in no table of contents and
 # anything loaded from another host are errors.
 docs: $(STAMP) ## Build the documentation's site in docs/_build/html
-	$(PY) -m sphinx --quiet --fail-on-warning --keep-going -c docs . docs/_build/html $(ARGS)
+	$(PY) -m sphinx --quiet --jobs auto --fail-on-warning --keep-going -c docs . docs/_build/html $(ARGS)
 	@echo docs/_build/html/index.html
 
 audit: $(STAMP) ## Look for flaws in the constraints' geometry (ARGS="key=value ...")

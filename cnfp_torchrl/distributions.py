@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import NamedTuple, NoReturn, TypeAlias
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
 from torch.distributions.utils import _standard_normal
 
-from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
+from cnfp_torchrl.bijectors import Bijector, Stages, has_latent, well_inside
 from cnfp_torchrl.geometry import broadcast_shape
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
+
+
+class NearestLogProb(NamedTuple):
+    """Densities of the actions well inside that are nearest to given ones.
+
+    Args:
+        log_prob: The log-densities ``(*batch,)``.
+        action: The actions that they are of, ``(*batch, d)``.
+        moved: The distances to the given actions, ``(*batch,)``, in action units; 0 where the given
+            one was well inside.
+    """
+
+    log_prob: Tensor
+    action: Tensor
+    moved: Tensor
 
 
 class ConstrainedFlow(TransformedDistribution):
@@ -23,8 +38,9 @@ class ConstrainedFlow(TransformedDistribution):
     change_of_variables). Every sample, mode and deterministic action lies in the image of the
     bijector, whatever the base.
 
-    Draw and score together with `rsample_and_log_prob`: `log_prob` of a given action inverts the
-    bijector, and where tanh is saturated in the dtype the inverse is lost.
+    Where tanh is saturated in the dtype an action has lost its latent, so that the density of a
+    given action is -inf there. The latent of the last draw is kept: `log_prob` of that very tensor,
+    if it was not changed since, is the density of what was drawn, as with `rsample_and_log_prob`.
 
     Args:
         base: over R^d with ``event_shape (d,)``, of float32 or float64; expanded to the batch shape
@@ -47,6 +63,7 @@ class ConstrainedFlow(TransformedDistribution):
         self.bijector = bijector
         self.base_dist = _expanded(base, bijector)
         self.transforms = [bijector]
+        self._last: _Draw | None = None
         Distribution.__init__(
             self, self.base_dist.batch_shape, self.base_dist.event_shape, validate_args=False
         )
@@ -61,7 +78,7 @@ class ConstrainedFlow(TransformedDistribution):
         """Return reparametrized actions ``(*sample, *batch, d)`` and their log-densities."""
         latent, latent_log_prob = _rsample_and_log_prob(self.base_dist, torch.Size(sample_shape))
         action, log_det = self._forward_and_scored_log_det(_checked(latent))
-        return _in_dtype_of(latent, action), latent_log_prob - log_det
+        return self._kept(latent, action), latent_log_prob - log_det
 
     def sample_and_log_prob(self, sample_shape: Shape = ()) -> tuple[Tensor, Tensor]:
         """Return actions ``(*sample, *batch, d)`` without gradients and their log-densities.
@@ -71,7 +88,7 @@ class ConstrainedFlow(TransformedDistribution):
         latent = _checked(self.base_dist.sample(torch.Size(sample_shape)))
         with torch.no_grad():
             action, log_det = self._forward_and_scored_log_det(latent)
-        return _in_dtype_of(latent, action), _log_prob(self.base_dist, latent) - log_det
+        return self._kept(latent, action), _log_prob(self.base_dist, latent) - log_det
 
     def rsample(self, sample_shape: Shape = ()) -> Tensor:
         """Return reparametrized actions ``(*sample, *batch, d)``."""
@@ -83,11 +100,21 @@ class ConstrainedFlow(TransformedDistribution):
             return self._pushed(self.base_dist.sample(torch.Size(sample_shape)))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log-density of actions by inversion, -inf outside the support.
+        """Return the log-density of actions ``(*sample, *batch, d)``, -inf outside the support.
 
-        A NaN action has a NaN density. On the boundary, where saturated actions of float32 may lie,
-        the density's limit is taken: -inf.
+        By inversion, unless it is the tensor that was drawn last, whose gradient then is that of
+        the draw. A NaN action has a NaN density. On the boundary, where saturated actions of
+        float32 may lie, the density's limit is taken: -inf.
+
+        Raises:
+            ValueError: when the value is not floating, not of vectors of d components, or of a
+                batch that does not broadcast with the distribution's.
         """
+        self._refuse_other_shapes(value)
+        if self._last is not None and self._last.is_of(value):
+            latent = self._last.latent
+            log_det = self.bijector.forward_and_log_det(latent)[1]
+            return _log_prob(self.base_dist, latent) - log_det
         inside, undefined = self.bijector.contains(value), value.isnan().any(-1)
         # Replaced before the inversion, because NaN would reach the gradients through `torch.where`
         # after it; by the action of a unit latent, because at 0 some bijectors are not smooth.
@@ -100,6 +127,17 @@ class ConstrainedFlow(TransformedDistribution):
         latent = torch.where(inside.unsqueeze(-1), latent, 0)
         elsewhere = torch.where(undefined, torch.nan, -torch.inf).to(log_det)
         return torch.where(inside, _log_prob(self.base_dist, latent) + log_det, elsewhere)
+
+    def entropy(self) -> NoReturn:
+        """Refuse, for a flow's entropy has no closed form.
+
+        Raises:
+            NotImplementedError: always; TorchRL's losses then average samples of their own.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no entropy in closed form; estimate it by "
+            "-distribution.rsample_and_log_prob((n,))[1].mean(0)"
+        )
 
     def stages(self, latent: Tensor) -> Stages:
         """Return intermediate actions and log-determinants of latents ``(*sample, *batch, d)``."""
@@ -124,11 +162,83 @@ class ConstrainedFlow(TransformedDistribution):
         """
         return self.deterministic_sample
 
+    def nearest_log_prob(self, value: Tensor, depth: float = 1e-3) -> NearestLogProb:
+        """Return the density of the action well inside that is nearest to each given one.
+
+        For actions that did not come from a flow, such as demonstrations or offline data, which may
+        lie on the boundary or a hair outside: `log_prob` is -inf there, and behavior cloning on it
+        learns nothing. Nearest means along the ray from the anchor, a bijective form's counterpart
+        of alpha projection; where an action is well inside it stays, and so does its density. ::
+
+            scored = actor.get_dist(batch).nearest_log_prob(batch["action"])
+            loss = -scored.log_prob.mean()
+
+        Args:
+            value: The actions ``(*sample, *batch, d)``, finite.
+            depth: The share of the way from the anchor to the boundary at which to score what lies
+                further out, between 0 and 1; of the order of the square root of the dtype's
+                rounding error or more, for the density to be exact.
+
+        Raises:
+            ValueError: for a depth outside of (0, 1), and for actions that are not finite.
+        """
+        if not 0 < depth < 1:
+            raise ValueError(f"depth: expected a share between 0 and 1, given {depth}")
+        if not bool(value.isfinite().all()):
+            index = (~value.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"value at index {index}: expected a finite number, given {value[tuple(index)]}"
+            )
+        action = well_inside(self.bijector, value, depth)
+        moved = torch.linalg.vector_norm(value - action, dim=-1)
+        return NearestLogProb(self.log_prob(action), action, moved)
+
     def _pushed(self, latent: Tensor) -> Tensor:
-        return _in_dtype_of(latent, self.bijector(_checked(latent)))
+        return self._kept(latent, self.bijector(_checked(latent)))
+
+    def _kept(self, latent: Tensor, action: Tensor) -> Tensor:
+        self._last = _Draw(latent, _in_dtype_of(latent, action))
+        return action
+
+    def _refuse_other_shapes(self, value: Tensor) -> None:
+        dim = self.event_shape[0]
+        if value.is_floating_point() and value.ndim > 0 and value.shape[-1] == dim:
+            try:
+                torch.broadcast_shapes(value.shape[:-1], self.batch_shape)
+            except RuntimeError:
+                pass
+            else:
+                return
+        raise ValueError(
+            f"value: expected floating actions (*sample, *batch, d) with batch shape "
+            f"{tuple(self.batch_shape)} and d = {dim}, given shape {tuple(value.shape)} and "
+            f"{value.dtype}"
+        )
 
     def _forward_and_scored_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         return self.bijector.forward_and_log_det(latent)
+
+
+class _Draw:
+    """The latent of an action, and how to recognize the action: by identity, if unchanged."""
+
+    def __init__(self, latent: Tensor, action: Tensor) -> None:
+        self.latent = latent
+        self._action = action
+        self._state = _state(action)
+
+    def is_of(self, value: Tensor) -> bool:
+        # Not by equality: equal actions of other latents exist where tanh is saturated. Of an
+        # action that gradients are asked for only later, the density must depend on it.
+        return value is self._action and _state(value) == self._state
+
+
+def _state(action: Tensor) -> tuple[int, bool]:
+    # Tensors of inference mode do not count their changes, and a compiler does not know the count:
+    # there an action must not be changed in place between drawing and scoring it.
+    if torch.compiler.is_compiling() or action.is_inference():
+        return 0, action.requires_grad
+    return action._version, action.requires_grad
 
 
 class ReferenceEntropyFlow(ConstrainedFlow):

@@ -7,7 +7,9 @@ constraints and actions of d components::
     constraints/
         NAME/                            one for each constraint, by its GeometryTransform:
             FIELD    (*batch, *event)        the set's fields, such as center and radius of a Ball
-            active   (*batch,) bool          whether the set holds as stated, by ConstraintAnchor
+            active   (*batch,) bool          whether the set holds, by ConstraintAnchor
+            relaxation      (*batch,)        by how much the set had to be widened, action units
+            row_relaxation  (*batch, m)      the same row by row, of sets that have rows
         safe_action  (*batch, d)         a candidate for the anchor, where a geometry knows one
         anchor       (*batch, d)         the point that gauges are taken about, by ConstraintAnchor
     loc, scale       (*batch, d)         the Gaussian's parameters, by the network
@@ -63,8 +65,18 @@ def field_key(constraint: str, field: str) -> tuple[str, str, str]:
 
 
 def active_key(constraint: str) -> tuple[str, str, str]:
-    """Return where it stands whether a constraint's set holds in a state as stated."""
+    """Return where it stands whether a constraint's set holds in a state."""
     return field_key(constraint, "active")
+
+
+def relaxation_key(constraint: str) -> tuple[str, str, str]:
+    """Return where it stands by how much a constraint's set had to be widened, ``(*batch,)``."""
+    return field_key(constraint, "relaxation")
+
+
+def row_relaxation_key(constraint: str) -> tuple[str, str, str]:
+    """Return where it stands by how much each row of a set was widened, ``(*batch, m)``."""
+    return field_key(constraint, "row_relaxation")
 
 
 class MissingGeometryError(KeyError):

@@ -20,7 +20,7 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
 
     Args:
         path: the file's final name.
-        exclusive: refuse to take the place of another file, whoever made it in the meantime.
+        exclusive: never replace another file, whoever made it in the meantime.
 
     Raises:
         FileExistsError: when exclusive and there is a file of this name.

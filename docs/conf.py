@@ -23,15 +23,15 @@ extensions = [
     "mathml",
     "names",
     "offline",
+    "pages",
 ]
 
 # Pages are read from the repository's root, so that a link from one file to another leads to the
 # same place here and where the repository is browsed.
-root_doc = "docs/index"
-include_patterns = ["docs/**", "experiments/**.md"]
-exclude_patterns = [
-    each.name for each in ROOT.iterdir() if each.name not in {"docs", "experiments"}
-]
+root_doc = "README"
+include_patterns = ["README.md", "docs/**", "experiments/**.md"]
+SOURCES = {"README.md", "docs", "experiments"}
+exclude_patterns = [each.name for each in ROOT.iterdir() if each.name not in SOURCES]
 exclude_patterns += ["docs/_build", "docs/_templates"]
 templates_path = ["_templates"]
 html_theme = "furo"
@@ -45,12 +45,15 @@ html_math_renderer = "mathml"
 
 # Every reference leads somewhere: `make docs` turns what is found here into errors.
 nitpicky = True
+# It stands in type stubs alone.
+nitpick_ignore = [("py:class", "DataclassInstance")]
 default_role = "py:obj"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True
 # An override without a docstring says nothing that its base class does not say.
 autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"

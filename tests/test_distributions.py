@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import weakref
 
 import numpy as np
 import pytest
@@ -439,3 +440,110 @@ def test_nothing_here_depends_on_numpys_random_numbers() -> None:
         torch.manual_seed(7)
         draws.append(distribution.sample((3,)))
     assert torch.equal(*draws)
+
+
+# Densities of own samples -------------------------------------------------------------------------
+
+
+def scored_jointly(distribution: ConstrainedFlow, draw: str) -> tuple[Tensor, Tensor]:
+    """Return an action drawn alone, and the score that drawing both together gives."""
+    torch.manual_seed(5)
+    _, log_prob = getattr(distribution, f"{draw}_and_log_prob")((30,))
+    torch.manual_seed(5)
+    return getattr(distribution, draw)((30,)), log_prob
+
+
+@pytest.mark.parametrize("draw", ["sample", "rsample"])
+@pytest.mark.parametrize("scale", [0.3, 5.0, 100.0])
+@pytest.mark.parametrize("case", CASES, **ids)
+def test_own_samples_have_the_density_of_their_draw(case: Case, scale: float, draw: str) -> None:
+    distribution = flow(case, torch.float32, scale)
+    action, log_prob = scored_jointly(distribution, draw)
+    assert log_prob.isfinite().all()
+    torch.testing.assert_close(distribution.log_prob(action), log_prob, rtol=1e-4, atol=1e-3)
+
+
+def test_own_samples_keep_the_gradients_of_their_draw() -> None:
+    bijector = BY_NAME["gauge-ball-d2"].build(torch.float64)
+    gradients = []
+    for apart in (False, True):
+        for draw in ("sample", "rsample"):
+            loc = torch.full((4, 2), 8.0, dtype=torch.float64, requires_grad=True)
+            distribution = ConstrainedFlow(gaussian(loc, torch.ones_like(loc)), bijector)
+            action, log_prob = scored_jointly(distribution, draw)
+            score = distribution.log_prob(action) if apart else log_prob
+            gradients.append(torch.autograd.grad(score.sum(), loc)[0])
+    torch.testing.assert_close(gradients[2:], gradients[:2])
+
+
+def test_only_the_very_draw_has_its_density() -> None:
+    """A copy, a changed action, an older draw are given actions: the boundary has no density."""
+    distribution = flow(BY_NAME["box-d3-batch"], torch.float32, 1e4)
+    older, action = distribution.sample((9,)), distribution.sample((9,))
+    assert distribution.log_prob(action).isfinite().all()
+    assert distribution.log_prob(action.clone()).isinf().any()
+    assert distribution.log_prob(older).isinf().any()
+    action.add_(0.0)
+    assert distribution.log_prob(action).isinf().any()
+
+
+def test_gradients_of_own_samples_can_be_asked_for_later() -> None:
+    distribution = flow(BY_NAME["gauge-ball-d2"], torch.float64)
+    action = distribution.sample((9,)).requires_grad_()
+    (gradient,) = torch.autograd.grad(distribution.log_prob(action).sum(), action)
+    again = action.detach().clone().requires_grad_()
+    (expected,) = torch.autograd.grad(distribution.log_prob(again).sum(), again)
+    torch.testing.assert_close(gradient, expected, rtol=0, atol=0)
+
+
+def test_own_samples_in_inference_mode_and_compiled() -> None:
+    bijector = BY_NAME["box-d3-batch"].build(torch.float32)
+
+    def score(loc: Tensor) -> tuple[Tensor, Tensor]:
+        base = Independent(Normal(loc, loc.new_ones(()), validate_args=False), 1)
+        distribution = ConstrainedFlow(base, bijector)
+        action = distribution.rsample()
+        return action, distribution.log_prob(action)
+
+    loc = torch.full((*bijector.shape,), 50.0)
+    with torch.inference_mode():
+        assert score(loc)[1].isfinite().all()
+    compiled = torch.compile(score, fullgraph=True, backend="aot_eager")
+    torch.manual_seed(2)
+    expected = score(loc)
+    torch.manual_seed(2)
+    torch.testing.assert_close(compiled(loc), expected)
+
+
+def test_a_draw_is_let_go_with_its_distribution() -> None:
+    distribution = flow(BY_NAME["gauge-ball-d2"], torch.float32)
+    action = weakref.ref(distribution.rsample())
+    assert action() is not None
+    distribution.rsample()
+    assert action() is None
+    action = weakref.ref(distribution.rsample())
+    del distribution
+    assert action() is None
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        torch.zeros(5, 1),
+        torch.tensor(0.0),
+        torch.zeros(3),
+        torch.zeros(5, 2, dtype=torch.long),
+        torch.zeros(7, 2),
+    ],
+    ids=["one column", "scalar", "other width", "integers", "other batch"],
+)
+def test_values_of_other_shapes_are_refused(value: Tensor) -> None:
+    base = gaussian(torch.zeros(5, 2), torch.ones(5, 2))
+    distribution = ConstrainedFlow(base, BY_NAME["gauge-ball-d2"].build(torch.float32))
+    with pytest.raises(ValueError, match=rf"value: .*d = 2, given shape .*{value.dtype}"):
+        distribution.log_prob(value)
+
+
+def test_entropy_says_how_to_estimate_it() -> None:
+    with pytest.raises(NotImplementedError, match="rsample_and_log_prob"):
+        flow(BY_NAME["gauge-ball-d2"], torch.float32).entropy()

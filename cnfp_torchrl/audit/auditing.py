@@ -99,13 +99,14 @@ def audit(
     Args:
         env: the environment, which is reset. With a larger batch the audit is faster.
         bijectors: bijectors, one for each constraint; None takes those of the geometry transforms.
-        order: the priority, see `cnfp_torchrl.modules.ConstrainedFlowModule`.
+        order: the constraints' names in order of application, see
+            `cnfp_torchrl.modules.ConstrainedFlowModule`.
         flow: the flow, see `cnfp_torchrl.modules.ConstrainedFlowModule`.
         actor: a constrained actor that acts in the rollouts, and whose flow is audited instead;
             None takes safe random actions.
         indicators: named indicators that judge a step; None takes the environment's ``cost``.
-        state_setter: puts the environment into given states; None takes that of the environment's
-            `cnfp_torchrl.envs.task_view.TaskView`, and copies environments without one.
+        state_setter: function that puts the environment into given states; None takes that of the
+            environment's `cnfp_torchrl.envs.TaskView`, and copies environments without one.
         settings: extent of the audit.
 
     Raises:

@@ -97,7 +97,7 @@ class StateSetterLookahead(Lookahead):
 
     Args:
         env: the environment.
-        state_setter: puts the environment into states.
+        state_setter: function that puts the environment into states.
         states: the states ``(n,)``, as the environment returned them.
         reader: what reads indicators and flags.
 

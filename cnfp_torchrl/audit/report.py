@@ -21,20 +21,20 @@ class ConstraintMetrics:
     """Measurements of one constraint, or of all of them together, in one set of states.
 
     Args:
-        name: of the constraint, or `TOGETHER`.
-        unsound: of the actions inside its set, those that its indicator calls a violation; None
+        name: the constraint's name, or `TOGETHER`.
+        unsound: share of the actions inside its set that its indicator calls a violation; None
             without an indicator.
-        escaped: of the flow's samples, those outside the set though it is active.
-        dead_ends: of the flow's samples that break nothing in states where everything is active,
-            those that led to a state in which it has to be dropped.
-        coverage: of the actions that its indicator allows, those inside its set; together, those
+        escaped: share of the flow's samples that lie outside the set though it is active.
+        dead_ends: share, of the flow's samples that break nothing in states where everything is
+            active, of those that led to a state in which it has to be dropped.
+        coverage: share of the actions that its indicator allows inside its set; together, of those
             that the flow can reach. Where it is active.
-        binding: the same, over those of the states in which the set leaves out any tried action.
-        dropped: of the states, those in which it is not active; together, any of them.
-        possible: of those, the ones in which some tried action keeps the indicator for a step.
-        volume: the share of the action bounds that it leaves, over the states where it is active.
-        slack: at the anchor, in action units, over the same states.
-        examples: states by kind of finding (``unsound``, ``escaped``, ``dead_ends``, ``dropped``),
+        binding: coverage in the states where the set leaves out any tried action.
+        dropped: share of the states in which it is not active; together, in which any is not.
+        possible: share of those in which some tried action keeps the indicator for a step.
+        volume: quantiles of its share of the action bounds, over the states where it is active.
+        slack: quantiles of the anchor's slack, in action units, over the same states.
+        examples: states by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``dropped``),
             the worst ones first.
     """
 
@@ -53,14 +53,14 @@ class ConstraintMetrics:
 
 @dataclass(frozen=True)
 class Executed:
-    """What happened while the policy acted.
+    """Counts of what happened while the policy acted.
 
     Args:
-        steps: how many were taken.
-        violations: of each indicator, over all steps.
-        led_into: of those, the violations in episodes in which the constraint had been active
-            before: allowed actions led from a state where it held to its violation.
-        examples: for each constraint, the last state in which it was active, with the action.
+        steps: number of steps.
+        violations: number of violations by indicator, over all steps.
+        led_into: number of those in episodes in which the constraint had been active before:
+            allowed actions led from a state where it held to its violation.
+        examples: last states in which each constraint was active, with the action.
     """
 
     steps: int
@@ -75,14 +75,14 @@ class WorstState:
 
     Args:
         name: the constraint's name.
-        source: where the state comes from.
-        reason: what makes the state the worst one.
+        source: the state's source, such as ``rollouts``.
+        reason: words for what makes the state the worst one.
         state: the state's entries.
         region: sets, anchor and flags, of batch shape ``()``.
         actions: the actions tried, ``(m, d)``.
-        inside: whether each lies in the constraint's set, ``(m,)``.
-        violates: whether the indicator calls it a violation, ``(m,)``.
-        dead_end: whether the constraint had to be dropped after it, ``(m,)``.
+        inside: mask of the actions in the constraint's set, ``(m,)``.
+        violates: mask of the actions that the indicator calls violations, ``(m,)``.
+        dead_end: mask of the actions after which the constraint had to be dropped, ``(m,)``.
     """
 
     name: str
@@ -101,14 +101,14 @@ class AuditReport:
     """Everything that an audit found; as a string, tables and the verdict.
 
     Args:
-        subject: what was audited: flow, order, policy, how actions were judged, settings.
+        subject: names of environment, flow and policy, and the settings.
         sources: measurements by where the states came from, then constraint; the last one is
             `TOGETHER`.
-        executed: what happened in the rollouts.
+        executed: counts of the rollouts.
         order: the constraints in order of application.
-        notes: what the numbers leave out.
-        strict: whether dead ends are flaws.
-        worst_states: one for each constraint, for pictures; not part of `as_dict`.
+        notes: remarks on what the numbers leave out.
+        strict: flag that makes dead ends flaws.
+        worst_states: worst states, one for each constraint, for pictures; not part of `as_dict`.
     """
 
     subject: dict[str, Any]

@@ -88,7 +88,7 @@ def draw_samples(
     """Draw actions in every state, through the flow and uniformly, and look one step ahead.
 
     Args:
-        lookahead: the states, and what actions lead to in them.
+        lookahead: the states, with a model of one step.
         head: the flow module.
         keys: the entries of a state that identify it.
         indicators: the names of the indicators that judge steps.

@@ -22,8 +22,8 @@ class Share:
     """A share of samples with a 95 % interval.
 
     Args:
-        count: how many.
-        of: out of how many.
+        count: number of hits.
+        of: number of samples.
         share: ``count / of``; None without samples.
         low: lower end of the interval.
         high: upper end of the interval.
@@ -44,8 +44,8 @@ class Share:
         agree on 0 or 1, the number of states counts.
 
         Args:
-            hits: in each cluster, ``(n,)``.
-            totals: of each cluster, ``(n,)``; clusters without samples count for nothing.
+            hits: number of hits in each cluster, ``(n,)``.
+            totals: number of samples of each cluster, ``(n,)``; empty clusters count for nothing.
         """
         hits, totals = hits[totals > 0].double(), totals[totals > 0].double()
         clusters, of = len(totals), int(totals.sum())
@@ -90,5 +90,5 @@ def plain(value: Tensor) -> Any:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, list):
-        return [_finite(each) for each in value]
+        return [_finite(element) for element in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

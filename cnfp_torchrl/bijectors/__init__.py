@@ -8,6 +8,7 @@ from cnfp_torchrl.bijectors.region_squash import ExactSquash, GaugeSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
 from cnfp_torchrl.bijectors.squashes import BallSquash, BoxSquash, EllipsoidSquash, paper_squash
+from cnfp_torchrl.bijectors.well_inside import reach, well_inside
 
 __all__ = [
     "BallSquash",
@@ -25,4 +26,6 @@ __all__ = [
     "Stages",
     "has_latent",
     "paper_squash",
+    "reach",
+    "well_inside",
 ]

@@ -6,7 +6,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def config_directory(package: Path = _PACKAGE) -> Path:
-    """Return the folder of the Hydra configs: the wheel's own copy, else the checkout's `conf/`.
+    """Return the folder of the Hydra configs: the wheel's own copy, else the checkout's ``conf/``.
 
     Args:
         package: the folder of the installed package.

@@ -1,4 +1,4 @@
-"""What settings may be: one table, for configurations and for the classes that they describe."""
+"""Validation of settings: one table, for configurations and for classes that they describe."""
 
 from __future__ import annotations
 
@@ -116,8 +116,8 @@ def require_setting(name: str, given: object) -> None:
     """Refuse a value that a setting of the table may not have.
 
     Args:
-        name: the setting's, as in `EXPECTED`.
-        given: its value.
+        name: the setting's name, as in `EXPECTED`.
+        given: the setting's value.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.

@@ -75,7 +75,7 @@ def read_plain(path: Path) -> dict[str, Any]:
         raise ValueError(f"{expected}, given something else: {error}; {remedy}") from error
     if odd or not isinstance(content, dict):
         raise ValueError(f"{expected}, given {odd or type(content).__name__}; {remedy}")
-    return {str(name): each for name, each in content.items()}
+    return {str(name): value for name, value in content.items()}
 
 
 def _tags_and_aliases(text: str) -> Iterator[str]:
@@ -91,15 +91,15 @@ def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Pa
     """Refuse a configuration that would do anything but build what it may name.
 
     Args:
-        content: plain data.
+        content: the configuration as plain data.
         trusted: further packages, modules or objects by their dotted names; what is defined in them
             may be named and gets any argument. The empty name trusts everything.
         path: the file, for the message.
 
     Raises:
-        PermissionError: naming file, place, target or argument, and the remedy.
+        PermissionError: naming file, position, target or argument, and the remedy.
     """
-    _Check(path, tuple(each.strip() for each in trusted)).walk(content, "", "", is_limited=False)
+    _Check(path, tuple(map(str.strip, trusted))).walk(content, "", "", is_limited=False)
 
 
 @cache
@@ -110,16 +110,16 @@ def nameable() -> frozenset[str]:
     classes beside them in the same modules, and `FOREIGN`; by the names under which they are
     public, and where they are defined.
     """
-    shipped = {each for each in _shipped_targets() if each.startswith(f"{_PACKAGE}.")}
+    shipped = {name for name in _shipped_targets() if name.startswith(f"{_PACKAGE}.")}
     objects = {name: locate(name) for name in (*FOREIGN, *shipped)}
     for module in {name.rpartition(".")[0] for name in shipped}:
         members = vars(import_module(module))
         for name in members.get("__all__", members):
-            if inspect.isclass(each := members[name]) and not name.startswith("_"):
-                is_public = "__all__" in members or each.__module__ == module
-                if is_public and _top(each.__module__) == _PACKAGE:
-                    objects[f"{module}.{name}"] = each
-    return frozenset(objects) | {_home(each) for each in objects.values()}
+            if inspect.isclass(member := members[name]) and not name.startswith("_"):
+                is_public = "__all__" in members or member.__module__ == module
+                if is_public and _top(member.__module__) == _PACKAGE:
+                    objects[f"{module}.{name}"] = member
+    return frozenset(objects) | set(map(_home, objects.values()))
 
 
 def locate(name: str) -> Any:
@@ -162,8 +162,8 @@ def targets(content: Any) -> Iterator[Any]:
         inner = content.values()
         if "_target_" in content:
             yield content["_target_"]
-    for each in inner:
-        yield from targets(each)
+    for value in inner:
+        yield from targets(value)
 
 
 def _top(name: str) -> str:
@@ -180,46 +180,46 @@ class _Check:
 
     Args:
         path: the file.
-        trusted: see `require_trusted`.
+        trusted: trusted names, see `require_trusted`.
     """
 
     def __init__(self, path: Path, trusted: tuple[str, ...]) -> None:
         self.path, self.trusted = path, trusted
 
-    def refuse(self, place: str, expected: str, given: Any) -> NoReturn:
+    def refuse(self, position: str, expected: str, given: Any) -> NoReturn:
         raise PermissionError(
-            f"{self.path}, {place.lstrip('.')}: expected {expected}, given {given!r}; nothing of "
-            "the run was executed. If you trust whoever wrote it, name the package that defines "
+            f"{self.path}, {position.lstrip('.')}: expected {expected}, given {given!r}; nothing "
+            "of the run was executed. If you trust whoever wrote it, name the package that defines "
             "what it needs: trusted=[my_package.] (cnfp-explain: --trusted my_package.)"
         )
 
-    def walk(self, content: Any, place: str, name: str, *, is_limited: bool) -> None:
+    def walk(self, content: Any, position: str, name: str, *, is_limited: bool) -> None:
         """Look at a value and everything in it.
 
         Args:
             content: the value.
-            place: where it stands.
+            position: the value's dotted position in the file.
             name: the key that it stands under, also in a list.
-            is_limited: it is an argument of a target that is not the reader's own.
+            is_limited: flag of an argument of a target that is not the reader's own.
         """
         if isinstance(content, dict):
-            self.walk_mapping(content, place, is_limited=is_limited)
+            self.walk_mapping(content, position, is_limited=is_limited)
         elif isinstance(content, list):
-            for i, each in enumerate(content):
-                self.walk(each, f"{place}[{i}]", name, is_limited=is_limited)
+            for i, value in enumerate(content):
+                self.walk(value, f"{position}[{i}]", name, is_limited=is_limited)
         elif isinstance(content, str):
             if "${" in content:
-                self.refuse(place, "a value without interpolation", content)
+                self.refuse(position, "a value without interpolation", content)
             expected, pattern = _TEXTS.get(name, _WORDS)
             if is_limited and not pattern.fullmatch(content):
-                self.refuse(place, expected, content)
+                self.refuse(position, expected, content)
 
-    def walk_mapping(self, content: dict[Any, Any], place: str, *, is_limited: bool) -> None:
+    def walk_mapping(self, content: dict[Any, Any], position: str, *, is_limited: bool) -> None:
         if "_target_" in content:
-            is_limited = not self.require_target(content["_target_"], f"{place}._target_")
+            is_limited = not self.require_target(content["_target_"], f"{position}._target_")
         for key, value in content.items():
             name = str(key)
-            inside = f"{place}.{name}"
+            inside = f"{position}.{name}"
             if "${" in name:
                 self.refuse(inside, "a key without interpolation", name)
             if name in _SPECIAL:
@@ -231,26 +231,26 @@ class _Check:
             if name != "_target_":
                 self.walk(value, inside, name, is_limited=is_limited)
 
-    def require_target(self, target: Any, place: str) -> bool:
+    def require_target(self, target: Any, position: str) -> bool:
         """Refuse a target that may not be named; return whether it may have any argument."""
         if isinstance(target, str):
             # The reader has named this very object, or everything.
             if "" in self.trusted or target in self.trusted:
                 return True
-            if any(target.startswith(f"{each.rstrip('.')}.") for each in self.trusted):
-                return self.require_defined(target, place)
+            if any(target.startswith(f"{name.rstrip('.')}.") for name in self.trusted):
+                return self.require_defined(target, position)
             if target in nameable():
                 return False
-        which = " or ".join([*FOREIGN, *(f"what is defined in {each}" for each in self.trusted)])
-        self.refuse(place, f"a target that the shipped configuration names, {which}", target)
+        which = " or ".join([*FOREIGN, *(f"what is defined in {name}" for name in self.trusted)])
+        self.refuse(position, f"a target that the shipped configuration names, {which}", target)
 
-    def require_defined(self, target: str, place: str) -> bool:
+    def require_defined(self, target: str, position: str) -> bool:
         """Refuse a name in a trusted package of something that is not defined there."""
         expected = f"a class or function that is defined in {_top(target)}"
         try:
             found = locate(target)
         except DetourError as error:
-            self.refuse(place, f"{expected} (but {error})", target)
+            self.refuse(position, f"{expected} (but {error})", target)
         except ImportError:
             # There is nothing to execute: Hydra will say that it cannot be found.
             return True
@@ -262,5 +262,5 @@ class _Check:
             # Such as a functools.partial: its home is the module that it stands in.
             is_defined = isinstance(locate(target.rpartition(".")[0]), ModuleType)
         if not is_defined or isinstance(found, ModuleType) or ".__" in target:
-            self.refuse(place, expected, target)
+            self.refuse(position, expected, target)
         return True

@@ -27,7 +27,7 @@ class ActionGuard(Transform):
     Append it right after the constraints: what is appended behind it, and changes actions, does so
     before it sees them::
 
-        env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
+        env = constrain_env(env, SpeedLimit(), KeepDistance())
         env.append_transform(ActionGuard())
 
     One step is one action in one state: a transform that repeats actions in states that nobody

@@ -44,8 +44,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
       family has rows.
 
     Args:
-        bijectors: one for each constraint; they know where the geometry lies.
-        order: the constraints' names in order of application, the last with the highest priority;
+        bijectors: One for each constraint; they know where the geometry lies.
+        order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order. The same as the flow's.
         leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
             smallest width of the action bounds.

@@ -10,7 +10,7 @@ from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.modules import ConstraintPublisher, appended_transforms, constraint_bijectors
 
-_EXAMPLE = "write constrain_env(env, BatteryGeometry(), ObstacleGeometry())"
+_EXAMPLE = "write constrain_env(env, SpeedLimit(), KeepDistance())"
 
 
 def constrain_env(

@@ -25,8 +25,9 @@ class ConstraintCost(Transform):
     a reset. ``cost`` under ``next`` is the cost of the action beside it.
 
     Args:
-        indicators: named indicators, for environments without costs; they see the tensordicts
-            before and after the step. None: the environment publishes ``cost`` itself.
+        indicators: Functions by the constraint's name, for environments without costs; they see
+            the tensordicts before and after the step. None: the environment publishes ``cost``
+            itself.
 
     Raises:
         TypeError: for indicators that are no mapping of names to functions.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from cnfp_torchrl.keys import (
     field_key,
     refuse_string,
 )
-from cnfp_torchrl.modules import ConstraintBijector, ConstraintPublisher
+from cnfp_torchrl.modules import ConstraintBijector, ConstraintPublisher, action_bounds
 
 
 class GeometryTransform(Transform, ConstraintPublisher):
@@ -45,11 +46,20 @@ class GeometryTransform(Transform, ConstraintPublisher):
     All states' sets are of one family.
 
     Args:
-        name: the constraint's name, by which flow and order refer to it.
-        in_keys: what `constraint_set` reads; refused when not finite.
+        name: The constraint's name, by which flow and order refer to it.
+        in_keys: The keys of what `constraint_set` reads; refused where not finite.
+
+        margin: The distance in action units by which every action is to stay inside, such as an
+            actuator's error. The published set is moved inwards by it.
+        resolution: The grid to which actions are rounded, to the nearest point, before they are
+            executed: a step in action units, or the actuator's dtype. A floating one, such as
+            ``torch.float16``, has steps relative to the largest action; an integer one, such as
+            ``torch.int8``, divides the action bounds. The set is moved inwards by half of the
+            grid's diagonal, so that the rounded action lies in the set that was stated. Action
+            bounds are not moved: they are to be points of the grid.
 
     Raises:
-        ValueError: for a bad or reserved name.
+        ValueError: for a bad or reserved name, a margin below 0 or a resolution that is no step.
         TypeError: for `in_keys` that are a string, and where `constraint_set` returns no set.
         GeometryError: for input that is not finite, for a set that is not one, for a second family
             and for a family that breaks the contract of `ConstraintSet`, naming key or constraint
@@ -58,7 +68,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     _family: type[ConstraintSet] | None = None
 
-    def __init__(self, name: str, in_keys: Sequence[NestedKey] = ("observation",)) -> None:
+    def __init__(
+        self,
+        name: str,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        *,
+        margin: float = 0.0,
+        resolution: float | torch.dtype | None = None,
+    ) -> None:
         if not isinstance(name, str) or not name or name in RESERVED_NAMES:
             raise ValueError(
                 f"name: expected a constraint's name other than {list(RESERVED_NAMES)}, "
@@ -66,7 +83,13 @@ class GeometryTransform(Transform, ConstraintPublisher):
             )
         refuse_string("in_keys", in_keys)
         super().__init__(in_keys=list(in_keys), out_keys=[(CONSTRAINTS_KEY, name)])
+        if not 0 <= margin < math.inf:
+            raise ValueError(f"margin: expected a distance >= 0 in action units, given {margin}")
+        if isinstance(resolution, int | float) and not 0 < resolution < math.inf:
+            raise ValueError(f"resolution: expected a step > 0 or a dtype, given {resolution}")
         self.name = name
+        self.margin, self.resolution = margin, resolution
+        self._inwards: float | None = None
 
     @abstractmethod
     def constraint_set(self, tensordict: TensorDictBase) -> ConstraintSet:
@@ -117,7 +140,55 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if type(allowed) is not self._family:
             self._refuse_what_is_no_set(allowed)
             self._family = type(allowed)
-        return allowed
+        return self._moved_inwards(allowed)
+
+    def _validated(self, allowed: ConstraintSet) -> ConstraintSet:
+        try:
+            return allowed.validate(self.name)
+        except GeometryError as error:
+            if self._inwards:
+                error.add_note(
+                    f"after the set was moved inwards by {self._inwards:.3g} for margin and "
+                    "resolution, which leaves nothing of it in this state: take less, or state the "
+                    "constraint as HalfSpaces, which give way by the least amount and say so"
+                )
+            raise
+
+    def _moved_inwards(self, allowed: ConstraintSet) -> ConstraintSet:
+        """Return the set without what lies closer to its boundary than margin and rounding."""
+        if self._inwards is None:
+            self._inwards = self.margin + self._largest_rounding(allowed.dim)
+        if self._inwards == 0:
+            return allowed
+        if not allowed.can_be_inflated():
+            raise TypeError(
+                f"constraint '{self.name}': expected a family of sets that can be moved inwards by "
+                f"margin and resolution, one that states `inflated`, given {type(allowed).__name__}"
+            )
+        first = next(iter(allowed.fields().values()))
+        return allowed.inflated(first.new_full((1,), -self._inwards))
+
+    def _largest_rounding(self, dim: int) -> float:
+        """Return the largest distance that rounding to the actuator's grid moves an action."""
+        if self.resolution is None:
+            return 0.0
+        if not isinstance(self.resolution, torch.dtype):
+            return self.resolution / 2 * math.sqrt(dim)
+        if self.parent is None:
+            raise RuntimeError(
+                f"constraint '{self.name}': expected to be part of an environment, which knows the "
+                "action bounds that a dtype's resolution depends on; append it first"
+            )
+        bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key).to(
+            torch.float64
+        )
+        if self.resolution.is_floating_point:
+            largest = torch.maximum(bounds.low.abs(), bounds.high.abs())
+            steps = torch.finfo(self.resolution).eps * largest
+        else:
+            limits = torch.iinfo(self.resolution)
+            steps = (bounds.high - bounds.low) / (limits.max - limits.min)
+        return float(steps.norm()) / 2
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         published = set(observation_spec.keys(include_nested=True, leaves_only=True))
@@ -158,7 +229,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.in_keys:
             self._refuse_what_is_not_finite(key, next_tensordict.get(key))
-        allowed = self.checked_set(next_tensordict).validate(self.name)
+        allowed = self._validated(self.checked_set(next_tensordict))
         for key, value in self._entries(next_tensordict, allowed).items():
             next_tensordict.set(key, value)
         return next_tensordict

@@ -44,8 +44,8 @@ class PackedStates(Transform):
     that the buffer overwrites its oldest transitions first, as TorchRL's default writer does.
 
     Args:
-        keys: the entries, at the root and under ``next``.
-        max_size: how many transitions the buffer holds.
+        keys: The entries' keys, at the root and under ``next``.
+        max_size: The number of transitions that the buffer holds.
     """
 
     def __init__(self, keys: Sequence[NestedKey], max_size: int) -> None:

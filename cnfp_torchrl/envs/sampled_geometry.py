@@ -24,8 +24,8 @@ class SampledGeometry(Transform):
     are to be stored.
 
     Args:
-        env: the environment whose transforms publish the sets.
-        names: of the constraints whose sets are computed.
+        env: The environment whose transforms publish the sets.
+        names: The names of the constraints whose sets are computed.
 
     Raises:
         KeyError: for a name that none of the environment's geometry transforms has.
@@ -50,7 +50,7 @@ class SampledGeometry(Transform):
         parts = tensordict, tensordict.get("next")
         states = torch.stack([each.select(*self.state_keys) for each in parts])
         for geometry in self._geometries:
-            allowed = geometry.constraint_set(states)
+            allowed = geometry.checked_set(states)
             for field, value in allowed.fields().items():
                 event = value.shape[value.ndim - allowed.event_dims[field] :]
                 key = field_key(geometry.name, field)
@@ -64,13 +64,13 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
 
     What an actor reads of ``constraints`` is stored once a state (`PackedStates`). The sets of a
     constraint are stored where all that is stored fits the limit, the largest sets first, because
-    looking up takes less time than computing. Anchor and flags, which take longest to compute,
-    always are.
+    looking up takes less time than computing. Anchor, flags and relaxations, which take longest to
+    compute, always are, even where they alone exceed the limit.
 
     Args:
-        env: the environment whose transforms publish the geometry.
-        keys: what the actor reads of a state.
-        limit: bytes of a stored transition that may be for constraints.
+        env: The environment whose transforms publish the geometry.
+        keys: The keys that the actor reads of a state.
+        limit: The bytes of a stored transition that may be for constraints.
     """
     spec = env.observation_spec
     sizes = {

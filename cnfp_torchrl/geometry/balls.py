@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import solve_triangular, vector_norm
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    largest_value,
+)
 from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone
 
@@ -121,11 +127,8 @@ class Ellipsoid(ConstraintSet):
         diagonal = torch.eye(self.dim, dtype=torch.bool, device=self.scale_tril.device)
         yield "scale_tril", (self.scale_tril <= 0) & diagonal, "a positive diagonal"
         thin = ~(spectral_norm_bound(self._inverse()) < MOST_SKEWED)
-        yield (
-            "scale_tril",
-            thin,
-            f"an inverse below {MOST_SKEWED:g} over the smallest of its diagonal",
-        )
+        expected = f"an inverse below {MOST_SKEWED:g} in units of the smallest diagonal element"
+        yield "scale_tril", thin, expected
 
     def shape_problem(self) -> str | None:
         rows, columns = self.scale_tril.shape[-2:]
@@ -136,9 +139,6 @@ class Ellipsoid(ConstraintSet):
     def whiten(self, vector: Tensor) -> Tensor:
         """Return ``T^-1 vector``, the vector in coordinates where the ellipsoid is a unit ball."""
         return _solve(self.scale_tril, vector)
-
-    def contains(self, action: Tensor) -> Tensor:
-        return self.to(torch.float64).slack(action.double()) >= 0
 
     def slack(self, action: Tensor) -> Tensor:
         """Return ``(1 - |T^-1 (a - m)|) / n``, n a bound of the norm of ``T^-1``."""
@@ -154,18 +154,22 @@ class Ellipsoid(ConstraintSet):
     def gauge_about(self, anchor: Tensor) -> Gauge:
         unit, scale_tril = self._in_units()
         of_ball = ball_gauge_about(_solve(scale_tril, anchor - self.center), unit)
-        return lambda direction: of_ball(_solve(scale_tril, direction))
+        # No closure: a flow's gauges are pickled with it.
+        return partial(_whitened_gauge, scale_tril, of_ball)
 
     def bounding_box(self) -> Bounds:
         half = length(self.scale_tril)
         return Bounds(self.center - half, self.center + half)
 
     def inflated(self, by: Tensor) -> Self:
-        unit, _ = self._in_units()
-        share = 1 + by.squeeze(-1) / unit * spectral_norm_bound(self._inverse())
-        return type(self)(
-            self.center, self.scale_tril * share[..., None, None], validate_args=False
-        )
+        # Not a share of T, which may be out of range beside a large amount. What `eroded` takes
+        # from the longer axes is added: `rounding` knows the shorter ones alone.
+        unit, scale_tril = self._in_units()
+        norm = spectral_norm_bound(self._inverse())
+        eps = 2 * EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        more = 1 + eps * norm * length(scale_tril.flatten(-2))
+        longer = unit + by.squeeze(-1) * norm * more
+        return type(self)(self.center, scale_tril * longer[..., None, None], validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
         return (EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size()).unsqueeze(-1)
@@ -210,6 +214,10 @@ class Ellipsoid(ConstraintSet):
         return solve_triangular(self._in_units()[1], self._identity(), upper=False)
 
 
+def _whitened_gauge(scale_tril: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
+    return of_ball(_solve(scale_tril, direction))
+
+
 def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
     return solve_triangular(scale_tril, vector.unsqueeze(-1), upper=False).squeeze(-1)
 
@@ -237,6 +245,9 @@ class TaskSpaceBall(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "jacobian", self.jacobian.isinf(), "finite elements"
         yield "offset", self.offset.isinf(), "a finite offset"
+        far = self.offset.abs() / largest_value(self.dtype) > self._norm().unsqueeze(-1)
+        expected = f"an offset up to {largest_value(self.dtype):g} times the norm of the jacobian"
+        yield "offset", far, expected
         yield "radius", (self.radius < 0) | self.radius.isinf(), "a finite radius >= 0"
 
     def shape_problem(self) -> str | None:

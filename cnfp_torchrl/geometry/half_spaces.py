@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, Bounds, ConstraintSet, Gauge
+from cnfp_torchrl.geometry.constraint_set import (
+    EROSION_IN_EPS,
+    Bounds,
+    ConstraintSet,
+    Gauge,
+    largest_value,
+)
 from cnfp_torchrl.geometry.norms import power_of_two
 from cnfp_torchrl.geometry.superlevel import Rows
 
@@ -38,6 +44,9 @@ class HalfSpaces(ConstraintSet):
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
+        size, most = self.normals.abs().amax(-1), largest_value(self.dtype)
+        far = (-self.offsets / most > size) & (size > 0)
+        yield "offsets", far, f"an offset above {-most:g} times the normal's largest element"
 
     def shape_problem(self) -> str | None:
         rows, offsets = self.normals.shape[-2], self.offsets.shape[-1]

@@ -144,13 +144,23 @@ class VisibleRegion(ConstraintSet):
         return Bounds(below, above)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        reach = self.position.abs().amax(-1) + self.step * magnitude
-        corners = torch.where(self.rectangles.isinf(), 0.0, self.rectangles).abs().amax((-2, -1))
-        grown = eps * (reach.unsqueeze(-1) + corners).unsqueeze(-1)
+        grown = self._grown(magnitude).unsqueeze(-1)
         low, high = self.rectangles.unbind(-2)
         rectangles = torch.stack([low - grown, high + grown], -2)
         return type(self)(self.position, rectangles, self.step, validate_args=False)
+
+    def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        """Return how far `eroded` moves the boundary, infinite where it takes in the position."""
+        moved = self._grown(magnitude).amax(-1) / self.step
+        outside = self.eroded(magnitude).slack(torch.zeros_like(self.position)) > 0
+        return torch.where(outside, moved, torch.inf).unsqueeze(-1)
+
+    def _grown(self, magnitude: Tensor | float) -> Tensor:
+        """Return the rounding error of each rectangle's corners, ``(*batch, m)``, in length."""
+        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        reach = self.position.abs().amax(-1) + self.step * magnitude
+        corners = torch.where(self.rectangles.isinf(), 0.0, self.rectangles).abs().amax((-2, -1))
+        return eps * (reach.unsqueeze(-1) + corners)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # One wall, the radius or more beyond 0, which the center moves the position to.
@@ -220,7 +230,7 @@ class VisibleOrBox(ConstraintSet):
     r"""The visible region where `in_sight` is 1, a box of actions where it is 0.
 
     A visible region always contains the zero action or nothing. Where rounding has brought a point
-    a hair inside the margin around an obstacle, the action must lead away from it, and a box that
+    a hair inside the margin around a rectangle, the action must lead away from it, and a box that
     leaves out 0 can say so.
 
     Args:

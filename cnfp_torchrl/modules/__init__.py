@@ -12,7 +12,7 @@ from cnfp_torchrl.modules.actors import (
 )
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
 from cnfp_torchrl.modules.exploration import refuse_exploration
-from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, LostDensityWarning
 from cnfp_torchrl.modules.flows import (
     ExactFlow,
     Flow,
@@ -48,6 +48,7 @@ __all__ = [
     "FlowMap",
     "GaugeFlow",
     "LatentActor",
+    "LostDensityWarning",
     "MissingGeometryError",
     "ProjectionFlow",
     "RadialFlow",

@@ -16,7 +16,9 @@ from cnfp_torchrl.keys import (
     active_key,
     field_key,
     refuse_string,
+    relaxation_key,
     require,
+    row_relaxation_key,
 )
 
 
@@ -67,16 +69,16 @@ class ConstraintBijector(TensorDictModuleBase):
     @property
     def relaxation_key(self) -> NestedKey:
         """Where `ConstraintAnchor` says by how much the constraint had to be widened in a state."""
-        return ("constraints", self.name, "relaxation")
+        return relaxation_key(self.name)
 
     @property
     def row_relaxation_key(self) -> NestedKey | None:
         """Where it says so row by row, if the family has rows."""
-        return ("constraints", self.name, "row_relaxation") if self.set_type.has_rows() else None
+        return row_relaxation_key(self.name) if self.set_type.has_rows() else None
 
     @property
     def amounts_key(self) -> NestedKey:
-        """Where the amounts are by which a flow widens the set: row by row if there are rows."""
+        """Where the amounts are by which a flow widens the set, row by row if there are rows."""
         return self.row_relaxation_key or self.relaxation_key
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import torch
@@ -10,11 +11,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, set_interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.distributions import Independent, Normal
 from torchrl.data import TensorSpec
 from torchrl.modules import SafeProbabilisticModule
 
-from cnfp_torchrl.bijectors import Bijector
+from cnfp_torchrl.bijectors import Bijector, reach
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Box, Region
 from cnfp_torchrl.keys import ACTION_KEY, ANCHOR_KEY, LOC_KEY, SCALE_KEY, require
@@ -23,6 +25,36 @@ from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_orde
 from cnfp_torchrl.modules.flows import Flow, resolve_flow
 
 _ANCHOR_REMEDY = "append cnfp_torchrl.envs.ConstraintAnchor after the geometry transforms"
+
+
+class LostDensityWarning(UserWarning):
+    """An actor scored actions of its own as impossible, because rounding took their latents."""
+
+
+class _ActorFlow(ConstrainedFlow):
+    """The distribution of an actor, which tells where the latents of its own actions are lost."""
+
+    on_lost: Callable[[], None] | None = None
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        log_prob = super().log_prob(value)
+        if self.on_lost is not None and self._has_lost(value, log_prob):
+            self.on_lost()
+        return log_prob
+
+    def _has_lost(self, value: Tensor, log_prob: Tensor) -> bool:
+        if torch.compiler.is_compiling() or is_functorch_wrapped_tensor(log_prob):
+            return False
+        lost = log_prob.isneginf()
+        if not bool(lost.any()):
+            return False
+        # On the boundary, as far as rounding can tell; further out it is somebody else's.
+        _, share = reach(self.bijector, value)
+        return bool((lost & (share >= 1 - 64 * torch.finfo(value.dtype).eps)).any())
+
+
+class _ActorReferenceFlow(_ActorFlow, ReferenceEntropyFlow):
+    """The same, scored jointly by the reference entropy."""
 
 
 class ConstrainedFlowModule(SafeProbabilisticModule):
@@ -39,24 +71,25 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     float64, and remain allowed when an environment rounds them to a float32 spec.
 
     Args:
-        spec: the bounded action spec; its bounds are stage 0 of the flow.
-        bijectors: one `ConstraintBijector` for each constraint.
-        order: the constraints' names in order of application, the last with the highest priority;
+        spec: The bounded action spec of one state, ``(d,)``; its bounds are stage 0 of the flow.
+        bijectors: One `ConstraintBijector` for each constraint.
+        order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
-        flow: how the sets are combined: a `Flow`, or ``exact``, ``gauge``, ``radial``, ``squash``,
-            ``projection``, ``unconstrained``.
-        in_keys: location and scale of the Gaussian, each ``(*batch, d)``.
-        out_key: the action, ``(*batch, d)``.
-        return_log_prob: also write the action's log-density, ``(*batch,)``.
-        default_interaction_type: how to act where no exploration type is set.
-        kwargs: passed on to `torchrl.modules.SafeProbabilisticModule`, such as ``log_prob_key``.
+        flow: The way to combine the sets: a `Flow`, or ``exact``, ``gauge``, ``radial``,
+            ``squash``, ``projection``, ``unconstrained``.
+        in_keys: The keys of the Gaussian's location and scale, each ``(*batch, d)``.
+        out_key: The key of the action, ``(*batch, d)``.
+        return_log_prob: Whether to write the action's log-density ``(*batch,)``, too.
+        default_interaction_type: The way to act where no exploration type is set.
+        kwargs: Further options of `torchrl.modules.SafeProbabilisticModule`, such as
+            ``log_prob_key``.
 
     Raises:
         ValueError: when the spec is unbounded, when an order does not name each constraint once, or
             for the log-density of a flow that has none.
     """
 
-    distribution_type: type[ConstrainedFlow] = ConstrainedFlow
+    distribution_type: type[_ActorFlow] = _ActorFlow
 
     def __init__(
         self,
@@ -88,6 +121,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
                 f"return_log_prob: expected False for {type(self.flow).__name__}, whose actions "
                 "have no density, given True; leave it out, or take another flow"
             )
+        self._has_warned = False
         self.parameter_keys = list(in_keys)
         self.in_keys = [*in_keys, *self.geometry_keys()]
 
@@ -171,7 +205,10 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if self.flow.reads_constraints:
             refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-        return self.distribution_type(base, bijector)
+        distribution = self.distribution_type(base, bijector)
+        if not self._has_warned:
+            distribution.on_lost = self._warn_of_lost_densities
+        return distribution
 
     build_dist_from_params = get_dist
 
@@ -193,6 +230,19 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             tensordict.set(key, value)
         with set_interaction_type(InteractionType.RANDOM):
             return self(tensordict)
+
+    def _warn_of_lost_densities(self) -> None:
+        """Warn, once for a module, that ratios of stored actions will be infinite or NaN."""
+        self._has_warned = True
+        warnings.warn(
+            "the density of stored actions is -inf where they are saturated: rounding has moved "
+            "them onto the boundary, and with it their latents to infinity. Losses that score "
+            "actions of the actor's own, such as PPO, A2C and REINFORCE, need "
+            "split_at_latent(actor), whose ratios are exact; for actions of others see "
+            "ConstrainedFlow.nearest_log_prob",
+            LostDensityWarning,
+            stacklevel=2,
+        )
 
     def _bounds_beside(self, tensordict: TensorDictBase) -> Box:
         """Return the bounds on the device of a tensordict's entries."""
@@ -247,4 +297,4 @@ def refuse_other_batch(key: NestedKey, given: Tensor, batch: torch.Size) -> None
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):
     """The same actions, scored for losses by the reference entropy (`ReferenceEntropyFlow`)."""
 
-    distribution_type = ReferenceEntropyFlow
+    distribution_type = _ActorReferenceFlow

@@ -6,7 +6,7 @@ Each is a small callable, chosen by `_target_` in ``conf/flow/`` or by its name 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from torch import Tensor
@@ -48,13 +48,14 @@ class Flow(ABC):
         """Return the bijector.
 
         Args:
-            bounds: the action bounds.
-            sets: the constraints' sets in order of application.
-            anchor: a point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact
+            bounds: The action bounds.
+            sets: The constraints' sets in order of application.
+            anchor: A point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact
                 flows.
-            active: which of bounds and sets hold, ``(*batch, K + 1)``; for exact flows.
-            relaxation: by how much the rows of bounds and sets are widened, ``(*batch, m)`` each;
-                for exact flows. None means that sets which do not hold are dropped.
+            active: Flags that say which of bounds and sets hold, ``(*batch, K + 1)``; for exact
+                flows.
+            relaxation: The amounts by which the rows of bounds and sets are widened, each
+                ``(*batch, m)``; for exact flows. None drops the sets which do not hold.
         """
 
 
@@ -63,9 +64,12 @@ class RegionFlow(Flow):
 
     is_safe = True
 
-    @abstractmethod
+    squash: ClassVar[Callable[..., Bijector]]
+    """The class of the bijector, made of a region."""
+
     def onto(self, region: Region) -> Bijector:
         """Return the bijector onto a region, which comes checked."""
+        return self.squash(region, validate_args=False)
 
     def __call__(
         self,
@@ -83,22 +87,19 @@ class RegionFlow(Flow):
 class ExactFlow(RegionFlow):
     """A tanh squash into the action bounds, then retractions into the intersection (default)."""
 
-    def onto(self, region: Region) -> ExactSquash:
-        return ExactSquash(region, validate_args=False)
+    squash = ExactSquash
 
 
 class GaugeFlow(RegionFlow):
     """The exact flow with every retraction radial, of boxes too."""
 
-    def onto(self, region: Region) -> GaugeSquash:
-        return GaugeSquash(region, validate_args=False)
+    squash = GaugeSquash
 
 
 class RadialFlow(RegionFlow):
     """A radial squash straight onto the intersection; for one or two action dimensions."""
 
-    def onto(self, region: Region) -> RadialSquash:
-        return RadialSquash(region, validate_args=False)
+    squash = RadialSquash
 
 
 class SquashFlow(Flow):

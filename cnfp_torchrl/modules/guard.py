@@ -73,7 +73,7 @@ class ExecutedActionGuard(TensorDictModuleBase):
     after a policy; `cnfp_torchrl.envs.ActionGuard` guards an environment against all policies.
 
     Args:
-        actor: the constrained actor whose constraints are checked.
+        actor: The constrained actor whose constraints are checked.
 
     Raises:
         TypeError: when the actor is not a constrained one.

@@ -40,9 +40,9 @@ class FlowMap(TensorDictModuleBase):
     actions (``experiments/examples/td3_latent_noise.py``).
 
     Args:
-        head: the flow module: of a constrained actor (`flow_head`), or one made for this purpose,
+        head: The flow module of a constrained actor (`flow_head`), or one made for this purpose,
             ``ConstrainedFlowModule(spec, bijectors)``.
-        latent_key: where the latent ``(*batch, d)`` stands.
+        latent_key: The key of the latent ``(*batch, d)``.
 
     Raises:
         ValueError: when called on latents of another dimension than the action.
@@ -74,7 +74,7 @@ class LatentGaussian(IndependentNormal):
     """The Gaussian under a flow, a distribution over latents that knows its action's entropy.
 
     Args:
-        flow: the distribution over actions; its base must be a Gaussian.
+        flow: The distribution over actions; its base must be a Gaussian.
     """
 
     def __init__(self, flow: ConstrainedFlow) -> None:
@@ -96,8 +96,8 @@ class LatentScorer(SafeProbabilisticModule):
     """The Gaussian under a flow as the last module of an actor, for losses.
 
     Args:
-        head: the flow module.
-        kwargs: passed on to `torchrl.modules.SafeProbabilisticModule`.
+        head: The flow module.
+        kwargs: Options of `torchrl.modules.SafeProbabilisticModule`.
     """
 
     def __init__(self, head: ConstrainedFlowModule, **kwargs: Any) -> None:
@@ -126,9 +126,9 @@ class LatentActor(NamedTuple):
     """A constrained actor cut at its latent; the networks are the actor's own.
 
     Args:
-        policy: draws and writes latent and log-density, then maps the latent to the action: for
-            collectors and environments.
-        base: ends at the latent, scores stored ones: the ``actor_network`` of a loss.
+        policy: The policy for collectors and environments, which writes latent and log-density,
+            then the action.
+        base: The actor up to the latent, which scores stored ones: ``actor_network`` of a loss.
     """
 
     policy: TensorDictSequential
@@ -155,9 +155,9 @@ def split_at_latent(
     pass ``with_reference_entropy(actor)``; for none, give the loss ``entropy_bonus=False``.
 
     Args:
-        actor: a constrained actor; parameters are shared, not copied.
-        latent_key: where the latents ``(*batch, d)`` are stored.
-        log_prob_key: where their log-densities ``(*batch,)`` are stored.
+        actor: A constrained actor; parameters are shared, not copied.
+        latent_key: The key of the latents ``(*batch, d)``.
+        log_prob_key: The key of their log-densities ``(*batch,)``.
 
     Raises:
         TypeError: when the actor does not end in a `ConstrainedFlowModule`.

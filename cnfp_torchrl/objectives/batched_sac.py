@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import zip_longest
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -39,6 +39,9 @@ class BatchedSACLoss(SACLoss):
         args: as for `torchrl.objectives.SACLoss`.
         kwargs: as for `torchrl.objectives.SACLoss`.
     """
+
+    _value_keys: ClassVar[dict[str, str]] = {"qvalue_network": "state_action_value"}
+    """Which of `tensor_keys` names the output of an ensemble."""
 
     _ensembles: dict[str, StackedPerceptron | Callable[..., TensorDictBase]]
 
@@ -162,11 +165,17 @@ class BatchedSACLoss(SACLoss):
         if online not in self._ensembles:
             self._ensembles[online] = self._ensemble(network)
         apply, action_key = self._ensembles[online], self.tensor_keys.action
+        value_key = getattr(self.tensor_keys, self._value_keys[online])
+        if value_key not in network.out_keys:
+            raise KeyError(
+                f"{online}: expected it to write {value_key!r}, given one that writes "
+                f"{network.out_keys}"
+            )
         if not isinstance(apply, StackedPerceptron):
             params = getattr(self, f"{name}_params")
             state = tensordict.select(*network.in_keys, strict=False).set(action_key, action)
             state = apply(state, params.detach() if detached else params)
-            return state.get(network.out_keys[-1])
+            return state.get(value_key)
         weights = self._weights(f"{name}_params")
         if detached:
             weights = {key: value.detach() for key, value in weights.items()}

@@ -8,7 +8,12 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.objectives import ValueEstimators
 
-from cnfp_torchrl.modules import has_density, with_reference_entropy
+from cnfp_torchrl.modules import (
+    ConstrainedFlowModule,
+    actor_modules,
+    has_density,
+    with_reference_entropy,
+)
 from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
 
 Entropy = Literal["reference", "action"]
@@ -31,8 +36,9 @@ class ConstrainedSACLoss(BatchedSACLoss):
         kwargs: passed on to `BatchedSACLoss`, which takes those of `torchrl.objectives.SACLoss`.
 
     Raises:
-        ValueError: for an unknown entropy, for ``action`` where actions have no density, and for a
-            discount outside [0, 1).
+        ValueError: for an unknown entropy, for ``action`` where actions have no density, for a
+            discount outside [0, 1), and for a batched spec where the target entropy is to be
+            -d, from the spec.
     """
 
     def __init__(
@@ -55,4 +61,19 @@ class ConstrainedSACLoss(BatchedSACLoss):
             )
         scored = with_reference_entropy(actor_network) if entropy == "reference" else actor_network
         super().__init__(scored, qvalue_network, **kwargs)
+        head = actor_modules(actor_network)[-1]
+        if kwargs.get("target_entropy", "auto") == "auto" and isinstance(
+            head, ConstrainedFlowModule
+        ):
+            self._require_target_entropy(head.action_dim)
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+    def _require_target_entropy(self, action_dim: int) -> None:
+        # SACLoss counts the numbers of the spec, those of all batch elements of a batched one.
+        counted = -round(float(self.target_entropy))
+        if counted != action_dim:
+            raise ValueError(
+                f"action_spec: expected that of one action, with {action_dim} components, given "
+                f"one with {counted}, which would make the target entropy {-counted} in place of "
+                f"{-action_dim}; pass action_spec=env.action_spec_unbatched"
+            )

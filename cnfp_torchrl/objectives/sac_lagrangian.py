@@ -73,6 +73,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         state_action_cost: NestedKey = "state_action_cost"
 
     default_keys = _AcceptedKeys
+    _value_keys = ConstrainedSACLoss._value_keys | {"cost_network": "state_action_cost"}
 
     cost_network: TensorDictModule
     cost_network_params: TensorDictParams
@@ -193,7 +194,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         predicted = self._costs("cost_network", tensordict, action)
         target = self._cost_target(tensordict).expand_as(predicted)
         # Not the robust loss of the value critic: it estimates something like a median, and that of
-        # a rare event, such as reaching a station just in time, is its absence.
+        # a rare event, such as a violation that is mostly avoided, is its absence.
         loss = (predicted - target).square()
         return self._reduced(loss.sum(-1).sum(0), tensordict)
 

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
-from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
 from cnfp_torchrl.modules import Flow, make_constrained_actor
 from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
 from cnfp_torchrl.training.environment import counted_constraints, make_environment
@@ -27,10 +27,10 @@ def build_environment(
     """Return the environment of a configuration.
 
     Args:
-        config: with sections ``env`` and ``flow``.
-        batch_size: replaces the batch size of environments that have one.
+        config: configuration with the sections ``env`` and ``flow``.
+        batch_size: batch size of environments that have one; None takes that of the configuration.
         with_anchor: publish anchor and active flags also where the flow does not need them.
-        with_penalty: with the penalty of ``env.penalty``, which is for training alone: policies
+        with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
     """
     flow: Flow = instantiate(config.flow)
@@ -39,11 +39,22 @@ def build_environment(
         replaced["batch_size"] = batch_size
     return make_environment(
         instantiate(config.env.base, **replaced, _convert_="all"),
-        {name: instantiate(each, _convert_="all") for name, each in config.env.geometry.items()},
+        {
+            name: instantiate(section, _convert_="all")
+            for name, section in config.env.geometry.items()
+        },
         order=application_order(config),
         with_anchor=with_anchor or flow.is_safe,
-        penalty=instantiate(config.env.get("penalty")) if with_penalty else None,
+        penalty=_penalty(config) if with_penalty else None,
     )
+
+
+def _penalty(config: DictConfig) -> RewardPenalty | None:
+    """Return what violations cost in training; a number serves as well, and 0 is none."""
+    penalty = config.env.get("penalty")
+    if isinstance(penalty, int | float):
+        return RewardPenalty(penalty) if penalty else None
+    return instantiate(penalty)
 
 
 def application_order(config: DictConfig) -> list[str]:
@@ -108,7 +119,7 @@ def load_actor(
 
     Args:
         folder: the run.
-        config: its configuration, from `RunFolder.load_config`.
+        config: the run's configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
 
     Raises:

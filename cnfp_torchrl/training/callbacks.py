@@ -99,7 +99,7 @@ def show_episodes(
     Args:
         folder: a finished run.
         settings: those of the evaluation that the episodes are part of.
-        factory: makes the callback.
+        factory: the maker of the callback.
         recording: the file to record into.
         trusted: see `RunFolder.load_config`.
     """
@@ -139,7 +139,9 @@ def replay_episodes(
         deterministic: take the deterministic policy and not the stochastic one.
     """
     recorder = EpisodeRecorder(numbers)
-    evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic, on_step=recorder)
+    evaluate_seeded(
+        env, guarded(actor, env), settings, deterministic=deterministic, on_step=recorder
+    )
     return list(recorder.episodes.values())
 
 

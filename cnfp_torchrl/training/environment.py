@@ -27,10 +27,10 @@ def make_environment(
 
     Args:
         base: the environment; if it counts violations, ``constraint_names`` names its costs.
-        geometries: one transform for each constraint, by its name.
+        geometries: transforms, one for each constraint, by its name.
         order: the constraints' names in order of application.
         with_anchor: also publish anchor and active flags, which exact flows need.
-        penalty: what violations cost; ``episode_reward`` sums the reward without it.
+        penalty: the price of violations; ``episode_reward`` sums the reward without it.
 
     Raises:
         ValueError: when a geometry publishes under another name than its own, or the order does not

@@ -89,7 +89,7 @@ class Evaluation:
         returns: undiscounted return of each episode, ``(episodes,)``.
         costs: violations of each episode by constraint, ``(episodes, K)``.
         names: the constraints' names.
-        steps: steps taken in all.
+        steps: number of steps taken in all.
     """
 
     returns: Tensor
@@ -155,12 +155,13 @@ def evaluate(
     """Run a policy for whole episodes and count.
 
     Args:
-        env: any batch size; as many batches are run as the episodes need, the first ones count.
-        policy: writes ``action``.
-        episodes: how many.
+        env: environment of any batch size; as many batches are run as the episodes need, of which
+            the first episodes count.
+        policy: any TorchRL policy.
+        episodes: number of episodes.
         deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
-        max_steps: a longer episode is an error: the environment never ends.
-        on_step: called with every transition of every batch, of the environment's batch size.
+        max_steps: length beyond which an episode counts as endless.
+        on_step: function that gets every transition, of the environment's batch size.
 
     Raises:
         ValueError: when `episodes` is not positive.
@@ -241,8 +242,8 @@ def evaluate_run(
     exact = flow_head(safe)
     score = instantiate(config.env.get("score"))
     policies: dict[str, tuple[Policy, bool]] = {
-        "trained, stochastic": (guarded(actor), False),
-        "trained, deterministic": (guarded(actor), True),
+        "trained, stochastic": (guarded(actor, env), False),
+        "trained, deterministic": (guarded(actor, env), True),
         "safe random": (SafeRandomPolicy(safe), False),
         "standing still": (StandStill(exact), False),
     }

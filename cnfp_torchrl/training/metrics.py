@@ -1,4 +1,4 @@
-"""What a run counts and writes down while it trains."""
+"""Counts and log of a training run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections.abc import Iterable, Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.record.loggers import Logger
+from torchrl.record.loggers import Logger, TensorboardLogger
 from tqdm import tqdm
 
 
 class Metrics:
-    """Count returns and violations over a run, log scalars, and move the progress bar.
+    """Counts of returns and violations, the log of scalars, and the progress bar.
 
     Args:
         loggers: TorchRL loggers; each scalar goes to all of them.
@@ -84,6 +84,9 @@ class Metrics:
         if self.frames > self._logged_at:
             self._log_entry()
         self._bar.close()
+        for logger in self._loggers:
+            if isinstance(logger, TensorboardLogger):
+                logger.close()  # ends its thread, which would outlive the run
 
     def _log_entry(self) -> None:
         self._logged_at = self.frames

@@ -21,9 +21,9 @@ def gaussian_network(
 
     Args:
         observation_size: number of observed numbers.
-        action_size: d.
+        action_size: number d of action components.
         hidden: widths of the hidden layers.
-        scale_mapping: how the scale is made positive, see `torchrl.modules.NormalParamExtractor`.
+        scale_mapping: map to a positive scale, see `torchrl.modules.NormalParamExtractor`.
         scale_lb: lower bound of the scale.
     """
     return nn.Sequential(
@@ -61,8 +61,8 @@ def action_cost_network(
 
     Args:
         observation_size: number of observed numbers.
-        action_size: d.
-        constraints: K, the number of outputs.
+        action_size: number d of action components.
+        constraints: number K of outputs.
         hidden: widths of the hidden layers.
     """
     network = MLP(

@@ -1,4 +1,4 @@
-"""What a run leaves behind, and how it is read back without trusting it."""
+"""The folder of a run: what training writes, and reading it back without trust."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class RunFolder:
         """
         path = self.path / CONFIG
         content = read_plain(path)
-        if missing := [each for each in BUILT[:3] if each not in content]:
+        if missing := [name for name in BUILT[:3] if name not in content]:
             raise ValueError(
                 f"{path}: expected the sections {list(BUILT[:3])} of a training run, but {missing} "
                 "are missing; give the folder that training printed when it ended"

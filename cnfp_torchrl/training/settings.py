@@ -11,7 +11,7 @@ from cnfp_torchrl.configuration import require_fields
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How data, updates and log entries follow each other.
+    """Numbers of warm-up steps, updates and log entries.
 
     Args:
         warmup_frames: environment steps with safe random actions, before the actor acts and learns.
@@ -35,11 +35,11 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """How a policy is judged.
+    """Number and seed of the episodes that policies are judged by.
 
     Args:
-        episodes: whole episodes for each policy.
-        seed: of the environment's starts and goals, the same for all policies.
+        episodes: number of whole episodes for each policy.
+        seed: seed of the environment and of what policies draw, the same for all of them.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.

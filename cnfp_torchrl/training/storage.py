@@ -26,11 +26,11 @@ def prepare_buffer(
     those are computed at sampling (`SampledGeometry`). Without constraints nothing is done.
 
     Args:
-        buffer: an empty one that overwrites the oldest transitions first.
-        env: publishes what is to be stored.
-        state_keys: what the actor reads of a state.
-        other_keys: what the loss reads besides states, action, reward and ends.
-        constraint_bytes: how much of a transition may be stored for constraints.
+        buffer: an empty buffer that overwrites the oldest transitions first.
+        env: the environment that publishes what is to be stored.
+        state_keys: entries of a state that the actor reads.
+        other_keys: entries that the loss reads besides states, action, reward and ends.
+        constraint_bytes: memory that a stored transition may take for constraints.
     """
     computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
     stored = [key for key in state_keys if key not in computed.field_keys]

@@ -41,8 +41,8 @@ def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     """Train, evaluate and leave everything in the run's folder.
 
     Args:
-        config: as composed from ``conf/train.yaml``.
-        folder: an empty one.
+        config: configuration as composed from ``conf/train.yaml``.
+        folder: an empty run folder.
 
     Returns:
         The summary that is also written to ``summary.json``.

@@ -10,12 +10,12 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 
 class Update:
-    """Learn from a batch of transitions.
+    """A step of learning from a batch of transitions.
 
     Args:
-        loss: whose outputs named ``loss_...`` are summed and descended.
-        optimizer: of the loss's parameters.
-        target: moves the loss's target networks after each step.
+        loss: the loss; its outputs named ``loss_...`` are summed and descended.
+        optimizer: optimizer of the loss's parameters.
+        target: updater of the loss's target networks, called after each step.
         compiled: compile the loss and its backward pass, which takes a minute or more, once.
     """
 

@@ -17,6 +17,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Write the pages before Sphinx looks for sources."""
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / FOLDER))
     app.connect("autodoc-process-docstring", describe_constant)
+    app.connect("autodoc-skip-member", skip_undescribed_field)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -43,6 +44,13 @@ def describe_constant(
     """Take a constant's docstring from the module that defines it, not from its type."""
     if what == "data":
         lines[:] = next(_constant_docstrings(name.rpartition(".")[2], value), [])
+
+
+def skip_undescribed_field(
+    app: Sphinx, what: str, name: str, value: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leave out fields of named tuples that Python itself describes; the class describes them."""
+    return True if str(getattr(value, "__doc__", "")).startswith("Alias for field") else None
 
 
 def _constant_docstrings(name: str, value: Any) -> Iterator[list[str]]:

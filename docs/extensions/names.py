@@ -1,10 +1,10 @@
 """References of docstrings, resolved as a reader of the code resolves them.
 
 A name in single backticks is looked up among the public names, whatever module the docstring stands
-in, and becomes a link to its page. What is no public name, but a name all the same, is set as code:
-a parameter, a field, a method of an own class, something of another library that can be imported.
-A path such as ``docs/method.md`` becomes a link to the page.
-Anything else is no name of anything, and reported.
+in, and becomes a link to its page, as does a path such as ``docs/method.md``. What is no public name,
+but a name all the same, is set as code: a parameter, a field, a method of an own class, something of
+another library that can be imported. Anything else is no name of anything, and reported. In pages
+that were written by hand, code that is a public name, or a call of one, becomes a link.
 """
 
 import importlib
@@ -28,6 +28,7 @@ PACKAGE = "cnfp_torchrl"
 def setup(app: Sphinx) -> dict[str, Any]:
     """Resolve what Sphinx itself does not find."""
     app.connect("missing-reference", resolve)
+    app.connect("doctree-resolved", link_code)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -52,6 +53,22 @@ def resolve(
     if target in _identifiers() or _imported(target) is not None:
         return shown
     return shown if rest and any(_has(owner, rest) for owner in _named(first)) else None
+
+
+def link_code(app: Sphinx, doctree: nodes.document, page: str) -> None:
+    """Link code that is a public name, in pages that were written by hand."""
+    if page.startswith("docs/api/"):
+        return
+    objects = app.env.get_domain("py").objects  # type: ignore[attr-defined]
+    for code in list(doctree.findall(nodes.literal)):
+        text = code.astext()
+        name = text.removeprefix(f"{PACKAGE}.").partition("(")[0]
+        # A single word in lower case may mean many things, unless it is called.
+        means_it = "(" in text or name != name.lower() or "_" in name
+        entry = objects.get(_simple().get(name, "")) if means_it else None
+        if entry is not None and not isinstance(code.parent, nodes.reference):
+            link = make_refnode(app.builder, page, entry.docname, entry.node_id, code.deepcopy())
+            code.replace_self(link)
 
 
 @cache
@@ -119,11 +136,10 @@ def _walk() -> Iterator[str]:
                 continue
             yield from _parameters(value)
             if inspect.isclass(value):
-                for base in value.__mro__:
-                    yield from getattr(base, "__annotations__", {})
-                for member in dir(value):
-                    yield member
-                    yield from _parameters(inspect.getattr_static(value, member, None))
+                yield from dir(value)
+                yield from getattr(value, "__annotations__", {})
+                for member in vars(value).values():
+                    yield from _parameters(member)
 
 
 def _parameters(value: Any) -> Iterator[str]:

@@ -44,17 +44,20 @@ def _is_own(room: ModuleType, name: str) -> bool:
 def home(room: str, name: str) -> str:
     """Return the full name under which a public name has its page.
 
-    A name that several rooms make public has its page in the room that defines it, or in the
-    deepest one that lists it: ``cnfp_torchrl.Ball`` is ``cnfp_torchrl.geometry.Ball``.
+    A name that several rooms make public has its page in the one that defines it, of rooms in each
+    other the outermost but not the package itself: ``cnfp_torchrl.Ball`` and what
+    ``cnfp_torchrl.geometry.ball`` defines are ``cnfp_torchrl.geometry.Ball``.
     """
     value = getattr(rooms()[room], name)
     defined_in = getattr(value, "__module__", room)
+    package = cnfp_torchrl.__name__
+    above = [other for other in rooms() if f"{defined_in}.".startswith(f"{other}.")]
     same = [
         other
         for other, module in rooms().items()
         if name in names_in(module) and getattr(module, name) is value
     ]
-    best = max(same, key=lambda other: (f"{defined_in}.".startswith(f"{other}."), len(other)))
+    best = min(same, key=lambda other: (other not in above, other == package, len(other)))
     return f"{best}.{name}"
 
 

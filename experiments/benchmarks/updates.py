@@ -247,43 +247,49 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=["update", "training"])
     parser.add_argument("--widths", type=int, nargs="+", default=[64, 256])
     parser.add_argument("--rounds", type=int, default=7, help="of training; updates take 9 times")
+    parser.add_argument("--frames", type=int, default=1600, help="steps of a training run")
     parser.add_argument("--compiled", action="store_true", help="also compiled updates: minutes")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    widths, rounds, repeats, frames = arguments.widths, arguments.rounds, 10, 1600
+    widths, rounds, repeats, frames = arguments.widths, arguments.rounds, 10, arguments.frames
     if arguments.quick:
         widths, rounds, repeats, frames = [8], 2, 1, 2 * AGENTS
     results: dict[str, dict[str, Any]] = {}
     load = {"before": os.getloadavg()}
-    for width in widths:
-        if "update" in arguments.parts:
-            times = time_updates(width, 9 * rounds, repeats, compiled=arguments.compiled)
-            results[f"update, batch {BATCH}, width {width}"] = {
-                "unit": "ms",
-                "rounds": 9 * rounds,
-                "rows": summary(times),
-            }
-        if "training" in arguments.parts:
-            speeds = time_training(width, rounds, 10 * AGENTS, frames)
-            results[f"training, {AGENTS} agents, width {width}"] = {
-                "unit": "steps/s",
-                "rounds": rounds,
-                "rows": summary(speeds),
-            }
-    load["after"] = os.getloadavg()
+
+    def keep(title: str, unit: str, measured: Rounds) -> None:
+        # After each part: what was measured is not lost when the next one is interrupted.
+        count = len(measured[REFERENCE])
+        results[title] = {"unit": unit, "rounds": count, "rows": summary(measured)}
+        load[f"after {title}"] = os.getloadavg()
+        write(arguments.output, results, load)
+
+    for part in arguments.parts:
+        for width in widths:
+            if part == "update":
+                times = time_updates(width, 9 * rounds, repeats, compiled=arguments.compiled)
+                keep(f"update, batch {BATCH}, width {width}", "ms", times)
+            else:
+                speeds = time_training(width, rounds, 10 * AGENTS, frames)
+                keep(f"training, {AGENTS} agents, width {width}", "steps/s", speeds)
+    print((arguments.output / "updates.md").read_text())
+
+
+def write(folder: Path, results: dict[str, dict[str, Any]], load: dict[str, Any]) -> None:
+    """Write results, versions and the machine's load to ``updates.json`` and ``updates.md``."""
     packages = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "stable-baselines3")
     about = {
         "command": f"python experiments/benchmarks/updates.py {' '.join(sys.argv[1:])}".rstrip(),
         "python": platform.python_version(),
         "processor": f"{platform.machine()}, {os.cpu_count()} cores, 1 thread",
         **{name: version(name) for name in packages},
-        "load": load,
+        "load over 1, 5 and 15 minutes": load,
     }
-    arguments.output.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "results": results}
-    (arguments.output / "updates.json").write_text(json.dumps(document, indent=1) + "\n")
+    (folder / "updates.json").write_text(json.dumps(document, indent=1) + "\n")
     lines = ["# Updates and training beside Stable-Baselines3", ""]
     lines += [f"- {key}: {value}" for key, value in about.items()] + [""]
     lines += [
@@ -291,15 +297,9 @@ def main() -> None:
         "less is better, of steps a second more."
     ]
     for title, each in results.items():
-        lines += [
-            "",
-            f"## {title} ({each['rounds']} rounds)",
-            "",
-            *table(each["rows"], each["unit"]),
-        ]
-    text = "\n".join([*lines, ""])
-    (arguments.output / "updates.md").write_text(text)
-    print(text)
+        lines += ["", f"## {title} ({each['rounds']} rounds)", ""]
+        lines += table(each["rows"], each["unit"])
+    (folder / "updates.md").write_text("\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":

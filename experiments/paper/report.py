@@ -191,7 +191,7 @@ def _page(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
         "Constrained 2D point navigation ([Rietz et al. 2024](https://arxiv.org/abs/2405.01198)) "
         "with the methods of the paper, the exact flow of this library and a projection: "
         f"{len(every)} runs, of {_values(run.steps for run in every)} environment steps each. A "
-        "command writes this page from the records in [data](data), every "
+        "command writes this page from the records in `data/`, every "
         "verdict by a [rule](details.md#claims-and-rules); no number and no verdict is written by "
         "hand."
     )

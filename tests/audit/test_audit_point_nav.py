@@ -50,6 +50,11 @@ def test_the_shipped_geometry_passes(make_config: Callable[..., DictConfig]) -> 
                 assert found(report, source, name, kind)["of"] > 100
     assert report.executed.violations == {"obstacle": 0, "battery": 0}
     assert report.executed.steps == 256 * 20
+    rows = [
+        line for line in str(report).split("\n") if line.startswith(("states", *report.sources))
+    ]
+    assert len(rows) == 2 * (1 + 2 * 3)
+    assert max(map(len, rows)) <= 100
     # Uniform states lie in the rectangle, too, and with batteries below the threshold.
     assert found(report, "uniform", "obstacle", "dropped")["count"] > 0
     assert found(report, "uniform", "battery", "dropped")["count"] > 0

@@ -45,9 +45,9 @@ def unchecked_region(low: torch.Tensor, high: torch.Tensor) -> Region:
 REFUSED = {
     "low above high": (
         lambda: BoxSquash(torch.tensor([0.0, 2.0]), torch.tensor([1.0, 1.0])),
-        "field 'low' at index [1]: expected low < high, given 2.0",
+        "field 'low' at index [1]: expected low <= high, given 2.0",
     ),
-    "low equal to high": (lambda: BoxSquash(ONE, ONE), "expected low < high, given 1.0"),
+    "low equal to high": (lambda: BoxSquash(ONE, ONE), "expected low < high, given low 1.0"),
     "NaN bound": (lambda: BoxSquash(ZERO, ONE * torch.nan), "field 'high' at index [0]"),
     "unbounded": (lambda: BoxSquash(ZERO, ONE * torch.inf), "BoxSquash: expected finite bounds"),
     "thin box": (
@@ -72,11 +72,11 @@ REFUSED = {
     ),
     "negative radius": (
         lambda: BallSquash(ZERO, torch.tensor(-0.5)),
-        "field 'radius': expected a finite radius > 0, given -0.5",
+        "field 'radius': expected a finite radius >= 0, given -0.5",
     ),
     "zero radius in a batch": (
         lambda: BallSquash(torch.zeros(3, 2), torch.tensor([1.0, 0.0, 1.0])),
-        "field 'radius' at index [1]: expected a finite radius > 0, given 0.0",
+        "BallSquash: expected a radius above rounding error in torch.float32",
     ),
     "ball below resolution": (
         lambda: BallSquash(1000 * ONE, torch.tensor(1e-3)),

@@ -38,6 +38,7 @@ def test_every_public_name_has_one_page(extension: type[ModuleType], tmp_path: P
     }
     assert pages == {"index"} | set(rooms) | homes
     assert public_names.home("cnfp_torchrl", "Ball") == "cnfp_torchrl.geometry.Ball"
+    assert public_names.home("cnfp_torchrl.geometry", "LEEWAY") == "cnfp_torchrl.geometry.LEEWAY"
 
 
 def test_pages_that_did_not_change_are_left_alone(

@@ -137,7 +137,7 @@ def test_a_set_must_be_one() -> None:
     for bad, message in (
         (
             Ball(center, -radius, validate_args=False),
-            r"'broken' .*'radius' at index \[0\].*radius > 0",
+            r"'broken' .*'radius' at index \[0\].*radius >= 0",
         ),
         (
             Ball(center / 0, radius, validate_args=False),

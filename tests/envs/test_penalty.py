@@ -87,6 +87,15 @@ def test_only_training_is_penalised() -> None:
         assert data["next", "episode_reward"].min() > -100
 
 
+@pytest.mark.parametrize(("number", "paid"), [("0", None), ("0.0", None), ("7", 7.0)])
+def test_a_number_is_a_penalty_too_and_zero_is_none(number: str, paid: float | None) -> None:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", overrides=[f"env.penalty={number}"])
+    env = build_environment(config, batch_size=[2], with_penalty=True)
+    penalties = [each.penalty for each in env.transform if isinstance(each, RewardPenalty)]
+    assert penalties == ([] if paid is None else [paid])
+
+
 def test_a_run_learns_from_the_penalty_and_reports_the_raw_return(tmp_path: Path) -> None:
     config = penalised(
         "env.penalty.penalty=1e6",

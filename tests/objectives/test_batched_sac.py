@@ -267,6 +267,20 @@ def test_it_equals_torchrl_s_under_other_keys(
     assert_equal(losses, batch)
 
 
+@pytest.mark.parametrize("batched", [True, False])
+def test_critics_write_under_another_key(
+    make_any_actor: MakeActor, batch: TensorDictBase, batched: bool
+) -> None:
+    network = MLP(in_features=7, out_features=1, num_cells=[8]) if batched else OwnCritic()
+    critic = TensorDictModule(network, ["observation", "action"], ["value"])
+    losses = both(make_any_actor("unconstrained"), critic)
+    with pytest.raises(KeyError, match=r"qvalue_network: expected .*'state_action_value', given"):
+        losses[1](batch.clone())
+    for loss in losses:
+        loss.set_keys(state_action_value="value")
+    assert_equal(losses, batch)
+
+
 def test_it_is_called_with_tensors(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
     results = []
     for loss in both(make_any_actor("unconstrained"), CRITICS["perceptron"]()):

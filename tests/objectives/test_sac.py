@@ -311,3 +311,19 @@ def test_unknown_settings_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         ConstrainedSACLoss(make_actor(), critic, action_spec=env.action_spec_unbatched, **options)
+
+
+@pytest.mark.parametrize("entropy", ["reference", "action"])
+def test_a_batched_action_spec_is_refused(
+    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, entropy: str
+) -> None:
+    batched = {"action_spec": env.action_spec, "entropy": entropy}
+    with pytest.raises(ValueError, match=r"action_spec: expected .* 2 components.*given .*128"):
+        ConstrainedSACLoss(make_actor(), critic, **batched)
+    # Where the number is given, the spec is not asked.
+    loss = ConstrainedSACLoss(make_actor(), critic, target_entropy=-4.0, **batched)
+    assert float(loss.target_entropy) == -4
+    composite = ConstrainedSACLoss(
+        make_actor(), critic, entropy=entropy, action_spec=env.full_action_spec
+    )
+    assert float(composite.target_entropy) == -2

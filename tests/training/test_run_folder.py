@@ -234,3 +234,18 @@ def test_missing_sections_are_named(missing: str, tmp_path: Path) -> None:
     OmegaConf.save({k: v for k, v in SECTIONS.items() if k != missing}, tmp_path / CONFIG)
     with pytest.raises(ValueError, match=missing):
         RunFolder(tmp_path).load_config()
+
+
+OLD: dict[str, Any] = {
+    "env": {"layout": {"_target_": "cnfp_torchrl.envs.Layout"}},
+    "flow": {"order": ["a"], "combine": {"_target_": "cnfp_torchrl.modules.ExactFlow"}},
+    "network": {},
+}
+
+
+@pytest.mark.parametrize("trusted", [(), ("",)])
+def test_a_run_of_version_0_1_is_refused_as_such(trusted: tuple[str, ...], tmp_path: Path) -> None:
+    OmegaConf.save(OLD, tmp_path / CONFIG)
+    with pytest.raises(ValueError, match=r"config\.yaml: .*version 0\.1.*train"):
+        RunFolder(tmp_path).load_config(trusted)
+    assert RunFolder(tmp_path).load_settings() == OLD

@@ -13,10 +13,10 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
 DEPTH = 2.5e-5
 """The least slack of an anchor in every set, as a share of the smallest width of the bounds.
 
-Gauges about an anchor with slack h carry a relative error of eps |a| / h, in float32 some 1e-3 for
-actions of the size of the bounds at this slack; smaller is not much use. Larger would relax thin
-sets that can hold: in 32 dimensions the largest ball in a weighted L1 ball 1e-3 wide has a radius
-of 8.8e-5.
+Gauges about an anchor with slack h carry a relative error of eps ``|a|`` / h, in float32 some 1e-3
+for actions of the size of the bounds at this slack; smaller is not much use. Larger would relax
+thin sets that can hold: in 32 dimensions the largest ball in a weighted L1 ball 1e-3 wide has a
+radius of 8.8e-5.
 """
 
 EROSIONS = 8.0

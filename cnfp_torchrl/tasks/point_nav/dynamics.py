@@ -65,7 +65,7 @@ class PointNavDynamics(nn.Module):
 
     Args:
         layout: the map; None takes the reference task.
-        collision: what a collision does, ``pass`` or ``block``.
+        collision: effect of a collision, ``pass`` or ``block``.
 
     Raises:
         ValueError: for an unknown `collision`, and where rectangles leave no room for starts.
@@ -141,10 +141,10 @@ class PointNavDynamics(nn.Module):
 
         Args:
             batch: the batch shape.
-            generator: of the random numbers; it is advanced by the same amount in any case.
-            position: anywhere in the arena, broadcast to ``(*batch, 2)``.
-            battery: in whole percent, broadcast to ``(*batch,)``.
-            goal: anywhere in the arena, broadcast to ``(*batch, 2)``.
+            generator: source of the random numbers, advanced by the same amount in any case.
+            position: positions anywhere in the arena, broadcast to ``(*batch, 2)``.
+            battery: charges in whole percent, broadcast to ``(*batch,)``.
+            goal: goals anywhere in the arena, broadcast to ``(*batch, 2)``.
 
         Raises:
             ValueError: for a given value of the wrong kind, range or shape.

@@ -43,9 +43,9 @@ class PointNavEnv(EnvBase):
         layout: the map; None takes the reference task.
         collision: ``pass``, the agent goes on through an obstacle and is clipped at the walls, or
             ``block``, it stays where it is; both are counted.
-        max_steps: an episode is truncated after this many steps.
-        device: where it computes.
-        seed: of starts and goals; None takes one from torch's global generator.
+        max_steps: length at which an episode is truncated.
+        device: the device to compute on.
+        seed: seed of starts and goals; None takes one from torch's global generator.
 
     Raises:
         ValueError: for a bad argument, a start state outside the arena, and for an action with NaN

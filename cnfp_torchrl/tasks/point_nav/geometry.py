@@ -1,7 +1,8 @@
 r"""The allowed actions of point navigation: a box for the obstacles, a ball for the battery.
 
-Both read the observation only, so that they work on any environment that shows it, and both count
-in action units, the displacement divided by the step length.
+`VisibleObstacleGeometry` takes all moves in sight in the box's place. All read the observation
+only, so that they work on any environment that shows it, and count in action units, the
+displacement divided by the step length.
 
 **What is guaranteed.** Let n be the charge before a step, and let
 
@@ -18,6 +19,11 @@ line to the nearest station, and the safe action lies at least 0.04 action units
 On other layouts it holds from starts with that property, where passages are wider than twice the
 clearance of `ShortestPath`. The obstacle's part alone holds from every position outside the
 rectangles.
+
+With all moves in sight in the box's place, the obstacle's part holds on any layout. The battery's
+part holds where the nearest station is in sight from everywhere, as on the reference layout: a move
+that the battery's ball allows ends where the nearest station is within reach. On other layouts the
+box keeps the way open, which the visible region does not.
 """
 
 from __future__ import annotations
@@ -29,7 +35,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cnfp_torchrl.envs import GeometryTransform
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, GeometryError
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    GeometryError,
+    VisibleOrBox,
+    VisibleRegion,
+)
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import (
     CAUTIOUS,
@@ -51,7 +64,7 @@ class PointNavGeometry(GeometryTransform):
     Args:
         layout: the map; None takes the reference task.
         name: the constraint's name; None takes the usual one.
-        observation_key: where the observation ``(*batch, 5)`` stands, not rescaled.
+        observation_key: key of the observation ``(*batch, 5)``, which must not be rescaled.
     """
 
     usual_name: ClassVar[str]
@@ -107,6 +120,44 @@ class ObstacleGeometry(PointNavGeometry):
         return Box(
             torch.where(beyond, outwards - 0.5, low.clamp(min=-1)),
             torch.where(beyond, outwards + 0.5, high.clamp(max=1)),
+            validate_args=False,
+        )
+
+
+class VisibleObstacleGeometry(PointNavGeometry):
+    """All moves whose straight way touches no obstacle: not convex, and less timid than a box.
+
+    Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
+    it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it
+    may leave out the zero action and so leads away.
+    """
+
+    usual_name = "obstacle"
+
+    def __init__(
+        self,
+        layout: Layout | None = None,
+        name: str | None = None,
+        observation_key: str = "observation",
+    ) -> None:
+        super().__init__(layout, name, observation_key)
+        self._box = ObstacleGeometry(layout, name, observation_key)
+        wall = torch.full((2,), self.layout.wall - MARGIN)
+        corners = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
+        grown = corners + MARGIN * torch.tensor([[-1.0], [1.0]])
+        self.register_buffer("_obstacles", torch.cat([grown, VisibleRegion.walls(-wall, wall)]))
+
+    def constraint_set(self, tensordict: TensorDictBase) -> VisibleOrBox:
+        """Return the moves in sight, or the box (docs/method.md, section 4)."""
+        position, _ = self.read(tensordict)
+        obstacles = self._obstacles.expand(*position.shape[:-1], *self._obstacles.shape)
+        step = torch.full_like(position[..., 0], self.layout.step_length)
+        region = VisibleRegion(position, obstacles, step, validate_args=False)
+        room = region.slack(torch.zeros_like(position)) >= MARGIN / self.layout.step_length
+        return VisibleOrBox(
+            **region.fields(),
+            **self._box.constraint_set(tensordict).fields(),
+            in_sight=room.to(position.dtype),
             validate_args=False,
         )
 

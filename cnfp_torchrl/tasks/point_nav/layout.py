@@ -26,14 +26,14 @@ class Layout:
     Args:
         rectangles: closed obstacles ``(x_low, y_low, x_high, y_high)``; none is fine.
         stations: the charging stations ``(x, y)``, at least one.
-        wall: the walls stand at +-wall on both axes.
-        zone_radius: a station charges at this distance or nearer.
-        step_length: an action a in [-1, 1]^2 moves the agent by ``step_length * a``.
-        goal_radius: the goal is reached at this distance or nearer.
+        wall: coordinate of the walls, which stand at +-wall on both axes.
+        zone_radius: largest distance at which a station charges.
+        step_length: length by which an action a moves the agent, ``step_length * a``.
+        goal_radius: largest distance at which the goal is reached.
         goal_bonus: the reward for reaching the goal.
-        start_limit: starts and goals are drawn uniformly from [-start_limit, start_limit]^2 ...
-        start_margin: ... outside each rectangle grown by this margin on every side.
-        battery_threshold: a charge below this percentage violates the battery constraint.
+        start_limit: half width of the square that starts and goals are drawn from uniformly.
+        start_margin: margin around every rectangle in which none is drawn.
+        battery_threshold: percentage below which the charge violates the battery constraint.
         battery_start: lowest and highest charge at the start, both included.
 
     Raises:

@@ -39,11 +39,11 @@ def render_point_nav(
 
     Args:
         layout: the map.
-        position: of the agent, in arena units.
-        battery: in whole percent.
-        goal: in arena units.
+        position: the agent's position, in arena units.
+        battery: charge in whole percent.
+        goal: the goal's position, in arena units.
         trail: positions so far, oldest first; it fades towards the oldest.
-        size: of the square picture, in pixels.
+        size: width of the square picture, in pixels.
 
     Returns:
         uint8, ``(size, size, 3)``.

@@ -109,8 +109,8 @@ class ShortestPath(nn.Module):
         The goal itself where it is in sight, or where no way exists.
 
         Args:
-            position: ``(*batch, 2)``.
-            goal: ``(*batch, 2)``.
+            position: positions, ``(*batch, 2)``.
+            goal: goals, ``(*batch, 2)``.
         """
         if len(self.corners) == 0:
             return goal
@@ -193,8 +193,8 @@ def side_distances(position: Tensor, rectangles: Tensor) -> Tensor:
     """Return the signed distances to the prolonged sides of each rectangle, positive outside.
 
     Args:
-        position: ``(*batch, 2)``.
-        rectangles: ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``.
+        position: positions, ``(*batch, 2)``.
+        rectangles: rectangles ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``.
 
     Returns:
         ``(*batch, R, 4)``, in the order of the rectangle's columns.
@@ -209,10 +209,10 @@ def visible(start: Tensor, end: Tensor, rectangles: Tensor, inflation: float) ->
     The segment is cut by the two slabs of each rectangle; what is left of it lies inside.
 
     Args:
-        start: ``(*batch, 2)``, broadcast against `end`.
-        end: ``(*batch, 2)``.
-        rectangles: ``(R, 4)``.
-        inflation: in arena units.
+        start: one end, ``(*batch, 2)``, broadcast against `end`.
+        end: the other end, ``(*batch, 2)``.
+        rectangles: rectangles, ``(R, 4)``.
+        inflation: margin that rectangles are grown by, in arena units.
 
     Returns:
         bool, ``(*batch,)``.
