@@ -34,7 +34,19 @@ PLANE_OF_OTHERS: dict[str, ConstraintSet] = {
     "power": PositivePart(t([1.0, 1.0]), t(1.1)),
     "diamond": WeightedL1Ball(t([1.0, 0.8]), t(0.9)),
 }
+
+
+class RigidBall(Ball):
+    """A ball that cannot be widened, and is dropped where it cannot hold."""
+
+    inflated = ConstraintSet.inflated
+
+
 CONFLICT: dict[str, ConstraintSet] = {
+    "far": RigidBall(t([1.3, 1.3]), t(0.5)),
+    "near": Ball(t([-0.5, -0.5]), t(0.6)),
+}
+RELAXED: dict[str, ConstraintSet] = {
     "far": Ball(t([1.3, 1.3]), t(0.5)),
     "near": Ball(t([-0.5, -0.5]), t(0.6)),
 }
