@@ -64,10 +64,14 @@ def first(sets: Mapping[str, ConstraintSet], count: int) -> dict[str, Constraint
 def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
     region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
     assert region.active is not None
+    assert region.relaxation is not None
     state = TensorDict({"observation": torch.zeros(3)}, [])
     state["constraints", "anchor"] = region.anchor
     for k, (name, each) in enumerate(sets.items(), start=1):
         state["constraints", name, "active"] = region.active[k]
+        state["constraints", name, "relaxation"] = region.relaxation[k].amax(-1)
+        if each.has_rows():
+            state["constraints", name, "row_relaxation"] = region.relaxation[k]
         for field, value in each.fields().items():
             state["constraints", name, field] = value
     return state
