@@ -69,9 +69,9 @@ audit: $(STAMP) ## Look for flaws in the constraints' geometry (ARGS="key=value 
 	$(PY) experiments/audit.py $(ARGS)
 
 view: $(STAMP) ## Open the newest recording in a Rerun viewer (ARGS="--web" for a browser)
-	$(PY) experiments/view.py $(ARGS)
+	$(PY) -m cnfp_torchrl.commands.view $(ARGS)
 
-explain: $(STAMP) ## Say in words what a policy did (ARGS="RUN --step N")
+explain: $(STAMP) ## Explain what a policy did in a step (ARGS="RUN --step N")
 	$(PY) experiments/explain.py $(ARGS)
 
 check: lint rooms types ## Check format, lint, imports between rooms, and types

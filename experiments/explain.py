@@ -1,6 +1,6 @@
 """Explain one step of a run: `python experiments/explain.py RUN --step N`."""
 
-from cnfp_torchrl.visual.explain_run import main
+from cnfp_torchrl.commands.explain import main
 
 if __name__ == "__main__":
     main()

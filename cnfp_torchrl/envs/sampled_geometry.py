@@ -64,8 +64,8 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
 
     What an actor reads of ``constraints`` is stored once a state (`PackedStates`). The sets of a
     constraint are stored where all that is stored fits the limit, the largest sets first, because
-    looking up takes less time than computing. Anchor and flags, which take longest to compute,
-    always are.
+    looking up takes less time than computing. Anchor, flags and relaxations, which take longest to
+    compute, always are, even where they alone exceed the limit.
 
     Args:
         env: The environment whose transforms publish the geometry.

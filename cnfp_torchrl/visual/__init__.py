@@ -1,24 +1,26 @@
-"""Pictures of flow policies and of runs, drawn with matplotlib and without a window."""
+"""What a flow policy does in a step: as values, as arrays, and in pictures.
+
+Nothing here draws; `cnfp_torchrl.visual.figures` paints with matplotlib and
+`cnfp_torchrl.visual.rerun` for Rerun's viewer.
+"""
 
 from cnfp_torchrl.visual.colors import constraint_colors
-from cnfp_torchrl.visual.flow_stages import flow_stages
-from cnfp_torchrl.visual.learning_curves import learning_curves, read_scalars
-from cnfp_torchrl.visual.run_figures import draw_run_figures
+from cnfp_torchrl.visual.explanation import Explanation, explain
+from cnfp_torchrl.visual.replay import replay_step
+from cnfp_torchrl.visual.scene import Scene
+from cnfp_torchrl.visual.setting import Setting
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, Stage, take_snapshot
 from cnfp_torchrl.visual.states import telling_states
-from cnfp_torchrl.visual.trajectories import Episode, record_episodes, trajectories
 
 __all__ = [
-    "Episode",
+    "Explanation",
     "FlowSnapshot",
+    "Scene",
+    "Setting",
     "Stage",
     "constraint_colors",
-    "draw_run_figures",
-    "flow_stages",
-    "learning_curves",
-    "read_scalars",
-    "record_episodes",
+    "explain",
+    "replay_step",
     "take_snapshot",
     "telling_states",
-    "trajectories",
 ]

@@ -8,29 +8,25 @@ from collections.abc import Iterable
 INK = "#222222"
 MUTED = "#8A8A8A"
 FAINT = "#D9D9D9"
-STATION = "#009E73"
-ZONE = "#CDEBE1"
-RECTANGLE = "#5A5A5A"
 GOAL = "#E69F00"
 
-# Named, so that pictures of different runs can be laid side by side.
-_FIXED = {"battery": "#0072B2", "obstacle": "#D55E00"}
-_OTHERS = ("#CC79A7", "#009E73", "#56B4E9", "#E69F00", "#6A3D9A", "#8C510A")
+_CONSTRAINTS = (
+    "#0072B2", "#D55E00", "#CC79A7", "#009E73", "#56B4E9", "#E69F00", "#6A3D9A", "#8C510A",
+)  # fmt: skip
 
 
 def constraint_colors(names: Iterable[str]) -> dict[str, str]:
     """Return a color, as ``#RRGGBB``, for each constraint.
 
     It depends on the set of names alone, not on their order: a run with another flow order shows
-    the same colors. From seven unknown names on, colors repeat.
+    the same colors. From nine names on, colors repeat.
 
     Args:
         names: of all constraints, in any order.
     """
     given = list(dict.fromkeys(names))
-    others = sorted(name for name in given if name not in _FIXED)
-    numbered = {name: _OTHERS[i % len(_OTHERS)] for i, name in enumerate(others)}
-    return {name: _FIXED.get(name) or numbered[name] for name in given}
+    numbered = {name: _CONSTRAINTS[i % len(_CONSTRAINTS)] for i, name in enumerate(sorted(given))}
+    return {name: numbered[name] for name in given}
 
 
 def rgb(color: str) -> tuple[int, int, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import contourpy
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cnfp_torchrl.geometry import ConstraintSet, Region
+from cnfp_torchrl.geometry import Box, ConstraintSet, Region
 
 Line = NDArray[np.float64]
 """Points in the plane, ``(points, 2)``."""
@@ -18,13 +18,101 @@ Line = NDArray[np.float64]
 View = tuple[float, float, float, float]
 """Lowest and highest first component, lowest and highest second one."""
 
-_RAYS = 1440
-_GRID = 400
-_FAR = 1e4
+_FAR = 1e5
 """A set without an end in some direction is drawn up to here, well beyond any view."""
+_STRAIGHT, _SAME = 1e-9, 1e-6
 
 
-def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> list[Line]:
+class Outlines:
+    """Boundaries of sets in the plane of two action components, seen from the region's anchor.
+
+    Along each ray the boundary lies at one over the gauge. In two dimensions that is all there is
+    of a set, and in one it is the interval's ends. In more it is the section through the anchor,
+    or the shadow that the set casts on the plane.
+
+    Args:
+        region: of one state, best in float64.
+        components: one or two components of the action.
+        rays: at equal angles; the corners of boxes have rays of their own.
+        shadows: take shadows, not sections; slow, and shadows of single sets are those of the part
+            within the action bounds, because that of a half-space alone would not show it.
+    """
+
+    def __init__(
+        self,
+        region: Region,
+        components: Sequence[int],
+        *,
+        rays: int = 360,
+        shadows: bool = False,
+    ) -> None:
+        chosen, dim = list(components), region.anchor.shape[-1]
+        self._anchor = region.anchor[chosen].numpy()
+        self._ray = _rays(self._anchor, _corners(region, chosen), rays)
+        self._hidden = [i for i in range(dim) if i not in chosen] if shadows else []
+        self._direction = region.anchor.new_zeros(dim, len(self._ray)).T
+        self._direction[:, chosen] = torch.from_numpy(self._ray).to(region.anchor)
+        self._region = region
+        count = len(region.sets)
+        self._holds = [True] * count if region.active is None else region.active.tolist()
+        self._gauges: list[NDArray[np.float64] | None] = [
+            each.gauge(self._direction, region.anchor).numpy() if self.holds(k) else None
+            for k, each in enumerate(region.sets)
+        ]
+        self._boundaries: dict[tuple[int, ...], Line] = {}
+
+    def holds(self, index: int) -> bool:
+        """Tell whether a set is active; of a dropped one no inner point is known."""
+        return self._holds[index]
+
+    def of_set(self, index: int) -> Line | None:
+        """Return the closed boundary of one set, ``(points, m)``; None for a dropped one."""
+        if not self.holds(index):
+            return None
+        return self.of_intersection((0, index) if self._hidden else (index,))
+
+    def of_intersection(self, applied: Sequence[int]) -> Line:
+        """Return the closed boundary of the intersection of those sets that hold."""
+        key = tuple(k for k in applied if self.holds(k))
+        if key not in self._boundaries:
+            gauges = [gauge for k in key if (gauge := self._gauges[k]) is not None]
+            largest = np.maximum.reduce([np.zeros(len(self._ray)), *gauges])
+            if self._hidden and key:
+                largest = self._least_gauge(key)
+            reach = self._ray / np.maximum(largest, 1 / _FAR)[:, None]
+            self._boundaries[key] = self._anchor + reach
+        return self._boundaries[key]
+
+    def _least_gauge(self, applied: Sequence[int]) -> NDArray[np.float64]:
+        """Return the gauge of the shadow, the least one over the components that are hidden.
+
+        Of a convex function, so that descent finds it; for other sets the shadow is no larger than
+        the true one.
+        """
+        sets, anchor = [self._region.sets[k] for k in applied], self._region.anchor
+        rest = torch.zeros(len(self._ray), len(self._hidden), dtype=anchor.dtype)
+
+        def gauge(rest: Tensor) -> Tensor:
+            direction = self._direction.index_copy(-1, torch.tensor(self._hidden), rest)
+            return torch.stack([each.gauge(direction, anchor) for each in sets]).amax(0)
+
+        best = gauge(rest)
+        with torch.enable_grad():
+            rest.requires_grad_()
+            optimizer = torch.optim.Adam([rest], lr=0.05)
+            schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, gamma=0.98)
+            for _ in range(200):
+                value = gauge(rest)
+                best = torch.minimum(best, value.detach())
+                optimizer.zero_grad()
+                value.sum().backward()
+                optimizer.step()
+                schedule.step()
+        found: NDArray[np.float64] = best.numpy()
+        return found
+
+
+def set_outline(each: ConstraintSet, view: View, nodes: int = 400) -> list[Line]:
     """Return the boundary of a set of actions in the plane, where its slack is zero.
 
     Works wherever the set lies, also for one that was dropped and has no point in common with the
@@ -33,11 +121,11 @@ def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> li
     Args:
         each: one set, of batch shape ``()`` and dimension 2.
         view: outside of it nothing is drawn.
-        nodes: of the grid along each axis; None takes as many as a figure needs.
+        nodes: of the grid along each axis.
     """
     x_low, x_high, y_low, y_high = view
-    x = torch.linspace(x_low, x_high, nodes or _GRID, dtype=torch.float64)
-    y = torch.linspace(y_low, y_high, nodes or _GRID, dtype=torch.float64)
+    x = torch.linspace(x_low, x_high, nodes, dtype=torch.float64)
+    y = torch.linspace(y_low, y_high, nodes, dtype=torch.float64)
     actions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     slack = each.to(torch.float64).slack(actions)
     # A slack may be infinite; a contour needs numbers on both sides of it.
@@ -47,75 +135,89 @@ def set_outline(each: ConstraintSet, view: View, nodes: int | None = None) -> li
 
 
 def region_outline(region: Region, applied: Sequence[int]) -> Line:
-    """Return the closed boundary of the intersection of some sets, seen from the region's anchor.
+    """Return the closed boundary of an intersection of sets in the plane, as fine as a print needs.
 
-    Along each ray the boundary lies at one over the largest gauge. In more than two dimensions it
-    is the boundary of the shadow that the intersection casts on the first two components.
+    In more than two dimensions it is the boundary of the shadow on the first two components.
 
     Args:
         region: of batch shape ``()`` and dimension 2 or more.
         applied: indices into its sets; those that are not active are left out.
     """
-    rays = _RAYS if region.anchor.shape[-1] == 2 else _RAYS // 2
-    angle = torch.linspace(0, 2 * torch.pi, rays + 1, dtype=torch.float64)
-    ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
-    gauge = shadow_gauge(region, applied, ray)
-    boundary = region.anchor[:2].double() + ray / gauge.clamp(min=1 / _FAR).unsqueeze(-1)
-    return boundary.numpy()
+    return Outlines(region.to(torch.float64), (0, 1), rays=1440, shadows=True).of_intersection(
+        applied
+    )
 
 
-def interval(region: Region, applied: Sequence[int]) -> tuple[float, float]:
-    """Return the ends of the intersection of some sets along the first component."""
-    ray = torch.zeros(2, 1, dtype=torch.float64)
-    ray[0], ray[1] = -1, 1
-    gauge = shadow_gauge(region, applied, ray).clamp(min=1 / _FAR)
-    low, high = (region.anchor[0].double() + ray.squeeze(-1) / gauge).tolist()
-    return low, high
+def within(line: Line, view: View) -> list[Line]:
+    """Return the pieces of a line ``(points, 2)`` that lie in a view, without needless points."""
+    x_low, x_high, y_low, y_high = view
+    x, y = line.T
+    inside: NDArray[np.bool_] = (x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high)
+    if inside.all():
+        return [_simplified(line)]
+    if not inside.any():
+        return []
+    low, high = np.array([x_low, y_low]), np.array([x_high, y_high])
+    if np.array_equal(line[0], line[-1]):
+        # A closed line has no ends of its own: it begins where it is out of view.
+        start = int(np.argmin(inside))
+        line = np.concatenate([line[start:-1], line[: start + 1]])
+        inside = np.concatenate([inside[start:-1], inside[: start + 1]])
+    pieces = []
+    # The first point of each run inside, and the one after its last.
+    steps = np.diff(inside.astype(np.int8), prepend=0, append=0)
+    starts, stops = np.flatnonzero(steps == 1).tolist(), np.flatnonzero(steps == -1).tolist()
+    for start, stop in zip(starts, stops, strict=True):
+        piece = [line[start:stop]]
+        if start > 0:
+            piece.insert(0, _cut(line[start], line[start - 1], low, high))
+        if stop < len(line):
+            piece.append(_cut(line[stop - 1], line[stop], low, high))
+        pieces.append(_simplified(np.concatenate(piece)))
+    return pieces
 
 
-def shadow_gauge(region: Region, applied: Sequence[int], ray: Tensor) -> Tensor:
-    """Return the gauge, about the region's anchor, of an intersection's shadow on the first axes.
+def _cut(inner: Line, outer: Line, low: Line, high: Line) -> Line:
+    """Return where the segment from an inner to an outer point leaves a box, ``(1, 2)``."""
+    way = outer - inner
+    room = np.where(way > 0, high - inner, low - inner)
+    share = np.divide(room, way, out=np.ones_like(way), where=way != 0).min()
+    cut: Line = (inner + min(share, 1.0) * way)[None]
+    return cut
 
-    The gauge of a projection is the least gauge over the components that are projected away. Of a
-    convex function, so that descent finds it; for other sets the shadow is no larger than the true
-    one.
 
-    Args:
-        region: of batch shape ``()``, dimension d.
-        applied: indices into its sets; those that are not active are left out.
-        ray: directions in the first m <= d components, ``(rays, m)``.
-    """
-    sets = [
-        region.sets[k].to(torch.float64)
-        for k in applied
-        if region.active is None or bool(region.active[k])
+def _simplified(line: Line) -> Line:
+    """Return the line without points in the middle of straight parts."""
+    if len(line) < 3:
+        return line
+    x, y = line.T
+    dx, dy = x[1:] - x[:-1], y[1:] - y[:-1]
+    keep = np.ones(len(line), dtype=bool)
+    keep[1:-1] = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:]) > _STRAIGHT
+    return line[keep]
+
+
+def _rays(anchor: Line, corners: Line, count: int) -> Line:
+    """Return directions all around, the first one again at the end, and those of the corners."""
+    if len(anchor) == 1:
+        return np.array([[-1.0], [1.0]])
+    x, y = (corners - anchor).T
+    angle = np.linspace(-np.pi, np.pi, count + 1)
+    angle = np.sort(np.concatenate([angle, np.arctan2(y, x)]))
+    # Two equal rays would hide the corner between them from `_simplified`.
+    angle = angle[np.diff(angle, prepend=-np.inf) > _SAME]
+    ray = np.stack([np.cos(angle), np.sin(angle)]).T
+    ray[-1] = ray[0]
+    return ray
+
+
+def _corners(region: Region, chosen: list[int]) -> Line:
+    """Return the corners of boxes, which rays at equal angles would cut off, ``(corners, m)``."""
+    ends = [
+        (each.low.numpy()[chosen], each.high.numpy()[chosen])
+        for each in region.sets
+        if isinstance(each, Box) and len(chosen) == 2
     ]
-    anchor = region.anchor.double()
-    hidden = anchor.shape[-1] - ray.shape[-1]
-
-    def gauge(rest: Tensor) -> Tensor:
-        direction = torch.cat([ray, rest], dim=-1)
-        each = [a_set.gauge(direction, anchor) for a_set in sets]
-        return torch.stack([torch.zeros(len(ray), dtype=ray.dtype), *each]).amax(0)
-
-    rest = torch.zeros(len(ray), hidden, dtype=ray.dtype)
-    if hidden == 0 or not sets:
-        return gauge(rest)
-    with torch.enable_grad():
-        return _least(gauge, rest)
-
-
-def _least(function: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
-    """Return the least values, one for each row, that descent from the start finds."""
-    rest = start.clone().requires_grad_()
-    optimizer = torch.optim.Adam([rest], lr=0.05)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, gamma=0.98)
-    best = function(start)
-    for _ in range(200):
-        value = function(rest)
-        best = torch.minimum(best, value.detach())
-        optimizer.zero_grad()
-        value.sum().backward()
-        optimizer.step()
-        schedule.step()
-    return best
+    corners = [(x, y) for low, high in ends for x in (low[0], high[0]) for y in (low[1], high[1])]
+    found = np.array(corners).reshape(-1, len(chosen))
+    return found[np.isfinite(found).all(-1)]

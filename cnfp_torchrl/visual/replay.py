@@ -13,8 +13,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.bijectors import SquashChain, has_latent
 from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import flow_head
-from cnfp_torchrl.visual.snapshot import FlowSnapshot, snapshot_of
-from cnfp_torchrl.visual.staged_flow import StagedFlow
+from cnfp_torchrl.visual.snapshot import FlowSnapshot, StagedFlow, snapshot_of
 
 
 @torch.no_grad()
@@ -55,7 +54,7 @@ def replay_step(
 def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     """Return the snapshot with the executed action before all samples."""
     region = snapshot.region.to(torch.float64)
-    staged = StagedFlow(snapshot.flow, region, [stage.applied for stage in snapshot.stages])
+    staged = StagedFlow(snapshot.head.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
     latent, inverse_log_det = (each[-1] for each in staged.inverse(given[None]))
     path, log_dets = staged.forward(latent)

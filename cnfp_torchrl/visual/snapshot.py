@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,11 +13,11 @@ from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import has_latent
+from cnfp_torchrl.bijectors import Bijector, has_latent
+from cnfp_torchrl.bijectors.bijector import Stages
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
-from cnfp_torchrl.visual.staged_flow import StagedFlow
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,11 @@ class FlowSnapshot:
         latent_log_density: ``(n,)``.
         stages: in order of application.
         region: sets (``sets[0]`` the action bounds), anchor and active flags of this state.
-        constraint_names: of ``region.sets[1:]``, in order of application.
         through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
         log_densities: of further actions ``(n, d)`` after each stage, ``(stages, n)``; -inf where
             there is none.
-        flow: how the sets are combined.
+        head: the policy's flow module.
         followed: index of the sample whose path through the stages is drawn.
         is_recovered: whether the path of an executed action is known; an action outside the flow's
             support, which another policy may have taken, has none and seems to stand still.
@@ -71,17 +70,21 @@ class FlowSnapshot:
     latent_log_density: Tensor
     stages: tuple[Stage, ...]
     region: Region
-    constraint_names: tuple[str, ...]
     through_stages: Callable[[Tensor], tuple[Tensor, Tensor]]
     log_densities: Callable[[Tensor], Tensor]
-    flow: Flow
+    head: ConstrainedFlowModule
     followed: int = 0
     is_recovered: bool = True
 
     @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """The names of ``region.sets[1:]``, in order of application."""
+        return tuple(self.head.order)
+
+    @property
     def is_safe(self) -> bool:
         """Whether the flow drops what cannot hold and keeps everything else."""
-        return self.flow.is_safe
+        return self.head.flow.is_safe
 
     @property
     def dim(self) -> int:
@@ -117,14 +120,6 @@ class FlowSnapshot:
             if self.is_active(index):
                 outside |= ~self.region.sets[index].contains(samples)
         return outside
-
-    def allowed_share(self, draws: int = 4096) -> float:
-        """Return which share of the action bounds is allowed, by drawing actions uniformly."""
-        bounds = self.region.bounds
-        generator = torch.Generator().manual_seed(0)
-        uniform = torch.rand(draws, self.dim, generator=generator).to(bounds.low)
-        actions = bounds.low + (bounds.high - bounds.low) * uniform
-        return float(self.region.contains(actions).double().mean())
 
     def path(self) -> Tensor:
         """Return the followed sample after each stage, ``(stages, d)``."""
@@ -218,10 +213,9 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
         latent_log_density=latent_log_density,
         stages=stages,
         region=on_host,
-        constraint_names=tuple(head.order),
         through_stages=through_stages,
         log_densities=log_densities,
-        flow=head.flow,
+        head=head,
     )
 
 
@@ -240,3 +234,70 @@ def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, 
 
 def _is_active(region: Region, index: int) -> bool:
     return region.active is None or bool(region.active[index])
+
+
+class StagedFlow:
+    """The bijectors of a flow up to each of its stages.
+
+    Args:
+        flow: how the sets are combined.
+        region: of one state.
+        applied: for each stage, indices into the region's sets of those applied so far.
+    """
+
+    def __init__(self, flow: Flow, region: Region, applied: Sequence[Sequence[int]]) -> None:
+        self._count = len(applied)
+        self._is_one = flow.is_safe and flow.has_density
+        self._bijectors: list[Bijector]
+        if self._is_one:
+            # To an exact flow, a set not yet applied is one that is not active.
+            holds = torch.tensor(
+                [[k in each for k in range(len(region.sets))] for each in applied],
+                device=region.anchor.device,
+            )
+            active = holds if region.active is None else holds & region.active
+            stages = flow(region.bounds, region.sets[1:], region.anchor, active.unsqueeze(1))
+            self._bijectors = [stages]
+        else:
+            self._bijectors = [stage_bijector(flow, region, each) for each in applied]
+
+    @property
+    def last(self) -> Bijector:
+        """The bijector up to the last stage, of an exact flow all of them at once."""
+        return self._bijectors[-1]
+
+    def forward(self, latents: Tensor) -> Stages:
+        """Return the actions of latents ``(n, d)`` after each stage, ``(stages, n, d)``."""
+        if self._is_one:
+            return self._each_stage(*self.last.forward_and_log_det(latents))
+        return self.last.stages(latents)
+
+    def inverse(self, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return latents ``(stages, n, d)`` that become actions ``(n, d)``, and log-determinants.
+
+        The log-determinants ``(stages, n)`` are those of the maps from actions to latents.
+        """
+        if self._is_one:
+            return self._each_stage(*self.last.inverse_and_log_det(actions))
+        found = [each.inverse_and_log_det(actions) for each in self._bijectors]
+        latents, log_dets = zip(*found, strict=True)
+        return torch.stack(latents), torch.stack(log_dets)
+
+    def _each_stage(self, points: Tensor, log_dets: Tensor) -> Stages:
+        # What no constraint has a part in has no stages of its own.
+        shape = (self._count, *points.shape[-2:])
+        return Stages(points.expand(shape), log_dets.expand(shape[:-1]))
+
+
+def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Bijector:
+    """Return the bijector of a flow up to a stage.
+
+    Args:
+        flow: how the sets are combined.
+        region: of one state.
+        applied: indices into the region's sets of those applied so far.
+    """
+    constraints = [k for k in applied if k > 0]
+    sets = [region.sets[k] for k in constraints]
+    active = None if region.active is None else region.active[..., [0, *constraints]]
+    return flow(region.bounds, sets, region.anchor, active)

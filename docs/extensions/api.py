@@ -9,6 +9,7 @@ from typing import Any
 from public_names import home, homes, names_in, rooms
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.inspect import signature, stringify_signature
 
 FOLDER = Path("docs", "api")
 
@@ -18,13 +19,14 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / FOLDER))
     app.connect("autodoc-process-docstring", describe_constant)
     app.connect("autodoc-skip-member", skip_undescribed_field)
+    app.connect("autodoc-process-signature", sign_as_constructor)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 def write_pages(folder: Path) -> None:
     """Write the sources of all pages into a folder, and remove those of names that are gone."""
     pages = {"index.rst": _index_page()}
-    pages |= {f"{room}.rst": _room_page(room) for room in rooms()}
+    pages |= {f"{room}.rst": _room_page(room) for room in shown_rooms()}
     for room, name, value in homes():
         pages[f"{room}.{name}.rst"] = _name_page(room, name, value)
     folder.mkdir(exist_ok=True)
@@ -36,6 +38,15 @@ def write_pages(folder: Path) -> None:
         # What has not changed keeps its time, so that Sphinx need not read it again.
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
+
+
+def shown_rooms() -> list[str]:
+    """Return the rooms that have a page: the package, and those in which some names are at home.
+
+    A room within a room whose names the outer one makes public needs no page.
+    """
+    with_pages = {room for room, _, _ in homes()}
+    return [room for room in rooms() if room in with_pages or "." not in room]
 
 
 def describe_constant(
@@ -53,6 +64,16 @@ def skip_undescribed_field(
     return True if str(getattr(value, "__doc__", "")).startswith("Alias for field") else None
 
 
+def sign_as_constructor(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, arguments: str, returned: str
+) -> tuple[str, str] | None:
+    """Show the arguments of a class's constructor, which tensordict's metaclass hides."""
+    if what != "class" or arguments != "(*args, **kwargs)":
+        return None
+    own = signature(value.__init__, bound_method=True)
+    return stringify_signature(own, unqualified_typehints=True, short_literals=True), returned
+
+
 def _constant_docstrings(name: str, value: Any) -> Iterator[list[str]]:
     for path, module in list(sys.modules.items()):
         if path.startswith("cnfp_torchrl.") and vars(module).get(name) is value:
@@ -63,7 +84,7 @@ def _constant_docstrings(name: str, value: Any) -> Iterator[list[str]]:
 
 def _index_page() -> str:
     """Return the table of rooms, and their pages for the sidebar."""
-    table = "\n".join(f"   {room}" for room in rooms())
+    table = "\n".join(f"   {room}" for room in shown_rooms())
     return (
         f"{_title('API')}Every public name has its page, from its docstring.\n\n"
         f".. autosummary::\n   :nosignatures:\n\n{table}\n\n"

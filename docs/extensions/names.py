@@ -1,10 +1,11 @@
 """References of docstrings, resolved as a reader of the code resolves them.
 
-A name in single backticks is looked up among the public names, whatever module the docstring stands
-in, and becomes a link to its page, as does a path such as ``docs/method.md``. What is no public name,
-but a name all the same, is set as code: a parameter, a field, a method of an own class, something of
-another library that can be imported. Anything else is no name of anything, and reported. In pages
-that were written by hand, code that is a public name, or a call of one, becomes a link.
+A name in single backticks is looked up among the public names, whatever module the docstring
+stands in, and becomes a link to its page, as does a path such as ``docs/method.md``. What is no
+public name, but a name all the same, is set as code: a parameter, a field, a method of an own
+class, something of another library that can be imported. Anything else is no name of anything,
+and reported. In pages that were written by hand, code that is a public name, or a call of one,
+becomes a link.
 """
 
 import importlib

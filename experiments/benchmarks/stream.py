@@ -34,7 +34,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
-from cnfp_torchrl.visual.stream import FlowStream, StreamHook, flow_blueprint
+from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, flow_blueprint
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 AGENTS = 16

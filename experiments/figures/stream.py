@@ -26,8 +26,8 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual.replay import replay_step
-from cnfp_torchrl.visual.stream import FlowStream, flow_blueprint
+from cnfp_torchrl.visual import replay_step
+from cnfp_torchrl.visual.rerun import FlowStream, flow_blueprint
 
 EPISODES, FRAMES = 16, 40
 NOTICES_S = 12.0

@@ -17,13 +17,15 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
-from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
-from cnfp_torchrl.visual import FlowSnapshot, flow_stages, take_snapshot
-from cnfp_torchrl.visual.banner import flow_banner
+from cnfp_torchrl.visual import FlowSnapshot, explain, take_snapshot
+from cnfp_torchrl.visual.figures import flow_stages
+from experiments.figures.banner import flow_banner
 from experiments.paper.records import Kept, Text
 
 ORDER = ["battery", "obstacle"]
@@ -155,15 +157,13 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
 def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
     """Return the flow on the map, and the permissive and the restrictive state."""
     flow, permissive, restrictive = (snapshot(policy, name) for name in PLACES)
-    layout = Layout()
+    view = find_task_view(PointNavEnv())
     restrictive = restrictive.following_the_longest_path()
     return {
-        "flow": flow_banner(flow, layout),
-        "permissive": flow_stages(
-            permissive, layout=layout, title=_title("Permissive", permissive)
-        ),
+        "flow": flow_banner(flow, view),
+        "permissive": flow_stages(permissive, view=view, title=_title("Permissive", permissive)),
         "restrictive": flow_stages(
-            restrictive, layout=layout, title=_title("Restrictive", restrictive)
+            restrictive, view=view, title=_title("Restrictive", restrictive)
         ),
     }
 
@@ -188,4 +188,6 @@ def _reset(env: TransformedEnv, place: Place) -> TensorDictBase:
 
 
 def _title(kind: str, drawn: FlowSnapshot) -> str:
-    return f"{kind} state: {100 * drawn.allowed_share():.0f} % of the actions are allowed"
+    share = explain(drawn).share_allowed
+    assert share is not None
+    return f"{kind} state: {100 * share:.0f} % of the actions are allowed"

@@ -38,8 +38,8 @@ from cnfp_torchrl.geometry import (
     VisibleRegion,
     WeightedL1Ball,
 )
-from cnfp_torchrl.visual.canvas import house_style, new_figure
 from cnfp_torchrl.visual.colors import FAINT, INK, MUTED
+from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.outlines import Line, View, region_outline, set_outline
 
 COLOR = "#E69F00"

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from cnfp_torchrl.visual.canvas import house_style, message_figure, new_figure
+from cnfp_torchrl.visual.figures.canvas import house_style, message_figure, new_figure
 from experiments.paper.labels import Label, in_order, label
 from experiments.paper.panels import (
     count_axis,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper.claims import (
     AIMS,
     BASELINE_CLAIMS,

@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.train import train
-from cnfp_torchrl.visual import read_scalars
+from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper.afterwards import evaluate_afterwards
 from experiments.paper.records import Evaluation, Record, Series, differences, record_path
 

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from cnfp_torchrl.audit import AuditReport, AuditSettings, ConstraintMetrics, Share, audit
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball
-from cnfp_torchrl.visual.audit_figure import audit_figure
+from cnfp_torchrl.visual.figures.audit import audit_figure
 
 LOWEST = 0.5
 SMALL = AuditSettings(states=128, actions=32, steps=3, seed=1)

@@ -18,7 +18,7 @@ from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bi
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual.audit_figure import audit_figure, save_audit
+from cnfp_torchrl.visual.figures.audit import audit_figure, save_audit
 
 ORDER = ["battery", "obstacle"]
 QUICK = ["batch=256", "audit.states=32", "audit.actions=16", "audit.steps=20"]

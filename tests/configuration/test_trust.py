@@ -191,7 +191,10 @@ HERE = {"_target_": "cnfp_torchrl.tasks.point_nav.Layout"}
 REFUSED: dict[str, tuple[Any, str]] = {
     "a foreign function": ({"_target_": "os.system", "command": "true"}, "os.system"),
     "an attribute hop": ({"_target_": CALL, "f": "evil.pt", "weights_only": False}, CALL),
-    "a function of ours that acts": ({"_target_": "cnfp_torchrl.visual.draw_run_figures"}, "draw"),
+    "a function of ours that acts": (
+        {"_target_": "cnfp_torchrl.visual.figures.draw_run_figures"},
+        "draw",
+    ),
     "our own reader": ({"_target_": "cnfp_torchrl.training.run_folder.RunFolder"}, "RunFolder"),
     "a method": ({"_target_": "cnfp_torchrl.tasks.point_nav.PointNavEnv.rollout"}, "rollout"),
     "a similar name": ({"_target_": "cnfp_torchrl_evil.run"}, "cnfp_torchrl_evil"),
@@ -366,7 +369,7 @@ def test_every_command_refuses(
 
 
 def test_the_figures_of_a_run_refuse(evil_run: Path, tmp_path: Path) -> None:
-    from cnfp_torchrl.visual import draw_run_figures
+    from cnfp_torchrl.visual.figures import draw_run_figures
 
     with pytest.raises(PermissionError, match=re.escape(CALL)):
         draw_run_figures(RunFolder.open(evil_run))

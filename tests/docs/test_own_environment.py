@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cnfp_torchrl.visual import run_figures
 from tests.entry_points import load_command
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "own_environment.md"
@@ -20,6 +19,7 @@ SHORTER = {
         "training.warmup_frames=32",
         "training.update_ratio=0.1",
         "evaluation.episodes=4",
+        "+figures.states=4",
     ],
     "cnfp-evaluate": ["evaluation.episodes=2"],
     "cnfp-explain": [],
@@ -31,7 +31,6 @@ SHORTER = {
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(run_figures, "_STATES", 4)
     CONFIG.parent.mkdir(parents=True)
     yield tmp_path
     sys.modules.pop(MODULE.stem, None)

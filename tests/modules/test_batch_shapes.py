@@ -36,6 +36,7 @@ def states(*batch: int) -> TensorDict:
             "center": center,
             "radius": torch.full(batch, 0.2),
             "active": torch.ones(batch, dtype=torch.bool),
+            "relaxation": torch.zeros(batch),
         },
         "anchor": center,
     }

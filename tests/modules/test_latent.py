@@ -19,6 +19,7 @@ from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, SoftUpdate, TD3Loss
 
 from cnfp_torchrl.modules import (
     FlowMap,
+    LostDensityWarning,
     MissingGeometryError,
     constrain,
     flow_head,
@@ -167,7 +168,9 @@ def test_the_action_itself_could_not_be_scored(
     actor = make_actor(Gaussian(12.0, 0.7), return_log_prob=True)
     with torch.no_grad():
         steps = actor(many(state, 32))
-    losses = ClipPPOLoss(actor, critic, entropy_bonus=False)(with_advantages(steps))
+    loss = ClipPPOLoss(actor, critic, entropy_bonus=False)
+    with pytest.warns(LostDensityWarning):
+        losses = loss(with_advantages(steps))
     assert not losses["ESS"].item() > 0.1
 
 

@@ -2,7 +2,6 @@
 
 import pytest
 
-from cnfp_torchrl.visual import banner, density
 from experiments.paper import statistics
 from tests.training.conftest import make_config, tiny_run
 from tests.visual.conftest import draws
@@ -14,5 +13,3 @@ __all__ = ["draws", "make_config", "tiny_run"]
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw and resample less than a report does."""
     monkeypatch.setattr(statistics, "RESAMPLES", 200)
-    monkeypatch.setattr(banner, "_COUNTED", 100_000)
-    monkeypatch.setattr(density, "_NODES", 41)

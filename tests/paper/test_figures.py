@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual import explain
+from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper.figures_flow import (
     PLACES,
     UNTRAINED,
@@ -85,7 +86,7 @@ def test_labels(method: str, name: str, baseline: bool) -> None:
 
 
 def test_places_are_what_they_are_called() -> None:
-    shares = {name: snapshot(UNTRAINED, name).allowed_share() for name in PLACES}
+    shares = {name: explain(snapshot(UNTRAINED, name)).share_allowed for name in PLACES}
     assert shares["permissive"] == 1
     assert shares["restrictive"] < 0.5
     for name in ("flow", "restrictive"):

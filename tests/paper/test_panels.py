@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from cnfp_torchrl.visual.canvas import new_figure
+from cnfp_torchrl.visual.figures.canvas import new_figure
 from experiments.paper.labels import Label
 from experiments.paper.panels import (
     count_axis,

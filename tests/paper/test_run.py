@@ -10,7 +10,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.visual import read_scalars
+from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper import run
 from experiments.paper.records import Record, RecordError, load_records
 from experiments.paper.run import commit, do_run, settings

@@ -6,12 +6,7 @@ from pathlib import Path
 import cnfp_torchrl
 
 PACKAGE = Path(cnfp_torchrl.__file__).parent
-OTHERS = [
-    path
-    for path in PACKAGE.rglob("*.py")
-    # The pictures still draw point navigation by name.
-    if path.relative_to(PACKAGE).parts[0] not in ("tasks", "visual")
-]
+OTHERS = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "tasks"]
 WORDS = re.compile("battery|obstacle|station(?!ar)|point_?nav", re.IGNORECASE)
 
 

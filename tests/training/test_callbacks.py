@@ -30,8 +30,8 @@ from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
-from cnfp_torchrl.visual.stream import Recording, RunningViewer
-from tests.visual.stream.recorded import read
+from cnfp_torchrl.visual.rerun import Recording, RunningViewer
+from tests.visual.rerun.recorded import read
 
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 FILE = ["visual=file", "visual.samples=16"]
@@ -157,7 +157,7 @@ def test_a_stream_that_fails_costs_no_results(
     def fail(*_: Any) -> None:
         raise OSError("no stream")
 
-    monkeypatch.setattr("cnfp_torchrl.visual.stream.watch.WatchedTraining.on_episode", fail)
+    monkeypatch.setattr("cnfp_torchrl.visual.rerun.run_stream.TrainingStream.on_episode", fail)
     with pytest.raises(OSError, match="no stream"):
         tiny_run(*FILE)
     folder = RunFolder.open(tmp_path / "run1")
@@ -296,7 +296,7 @@ def test_replayed_episodes_are_those_of_the_evaluation(
         total = sum(float(step["next", "reward"]) for step in episode)
         assert total == pytest.approx(float(expected[number]), rel=1e-5)
 
-    factory = instantiate({"_target_": "cnfp_torchrl.visual.stream.Watch", "episodes": 2})
+    factory = instantiate({"_target_": "cnfp_torchrl.visual.rerun.RunStream", "episodes": 2})
     path = tmp_path / "recording.rrd"
     show_episodes(folder, settings, factory, path).close()
     assert steps_of(path, "/explanation") == list(range(24))

@@ -18,7 +18,7 @@ from torch import nn
 
 from cnfp_torchrl.training.agent import build_actor, build_environment, load_actor
 from cnfp_torchrl.training.run_folder import CHECKPOINT, CONFIG, SUMMARY, RunFolder
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
 
 

@@ -7,8 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from cnfp_torchrl.visual import density, states
-from cnfp_torchrl.visual.canvas import save_png
+from cnfp_torchrl.visual.figures.canvas import save_png
 
 
 def is_a_picture(path: Path) -> bool:
@@ -22,11 +21,3 @@ def is_a_picture(path: Path) -> bool:
 def draws(tmp_path: Path) -> Callable[[Figure], bool]:
     """Whether a figure comes out as a picture."""
     return lambda figure: is_a_picture(save_png(figure, tmp_path / "figure.png", dpi=60))
-
-
-@pytest.fixture(autouse=True)
-def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Coarser grids and fewer candidate states than in real figures, to be quick."""
-    monkeypatch.setattr(density, "_NODES", 41)
-    monkeypatch.setattr(density, "_NODES_IN_ONE", 201)
-    monkeypatch.setattr(states, "_CANDIDATES", 256)

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 
+from cnfp_torchrl.envs import TaskView
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
 from cnfp_torchrl.visual import FlowSnapshot
-from cnfp_torchrl.visual.explanation import explain
-from cnfp_torchrl.visual.words import ConstraintEffect, Explanation
+from cnfp_torchrl.visual.explanation import ConstraintEffect, Explanation, explain
 from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_snapshot
 
 t = torch.tensor
@@ -131,9 +132,16 @@ def test_any_dimension_and_any_number_of_constraints(
         assert "None" not in said
 
 
-def test_what_the_environment_says_is_passed_on() -> None:
-    snapshot = make_snapshot(LINE, dim=1)
-    explanation = explain(snapshot, facts={"box": "The end is near."}, situation="At home.")
+class Home(TaskView):
+    def situation(self, state: TensorDictBase) -> str:
+        return "At home."
+
+    def constraint_sentences(self, state: TensorDictBase) -> dict[str, str]:
+        return {"box": "The end is near."}
+
+
+def test_what_the_task_says_is_passed_on() -> None:
+    explanation = explain(make_snapshot(LINE, dim=1), Home())
     for said in (explanation.text(), explanation.markdown()):
         assert "At home." in said
         assert said.count("The end is near.") == 1

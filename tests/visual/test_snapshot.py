@@ -5,9 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from cnfp_torchrl.visual import take_snapshot
-from cnfp_torchrl.visual.density import base_log_density
-from cnfp_torchrl.visual.flow_stages import stage_grids
-from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_snapshot
+from cnfp_torchrl.visual.snapshot import StagedFlow, stage_bijector
+from tests.visual.cases import CONFLICT, LINE, PLANE, PLANE_OF_OTHERS, SPACE, make_snapshot
 
 DIMENSIONS = {1: LINE, 2: PLANE, 3: SPACE}
 
@@ -28,38 +27,6 @@ def test_other_flows_are_seen_to_break_constraints(flow: str) -> None:
     assert last.any()
     expected = ~snapshot.region.contains(snapshot.stages[-1].samples)
     assert torch.equal(last, expected)
-
-
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash"])
-@pytest.mark.parametrize("dim", [1, 2])
-def test_density_of_every_stage_integrates_to_one(
-    flow: str, dim: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cnfp_torchrl.visual.density._NODES", 201)
-    monkeypatch.setattr("cnfp_torchrl.visual.density._NODES_IN_ONE", 4001)
-    snapshot = make_snapshot(DIMENSIONS[dim], flow, dim=dim)
-    grids = stage_grids(snapshot)
-    assert grids is not None
-    assert len(grids) == len(snapshot.stages)
-    for points, log_density in grids:
-        density = log_density.double().exp()
-        points = points.double()
-        if dim == 1:
-            mass = torch.trapezoid(density, points[:, 0])
-        else:
-            one = points[1:, 1:] - points[:-1, :-1]
-            other = points[:-1, 1:] - points[1:, :-1]
-            area = (one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]).abs() / 2
-            corners = density[1:, 1:] + density[:-1, :-1] + density[:-1, 1:] + density[1:, :-1]
-            mass = (area * corners / 4).sum()
-        # The grid ends at 3.2 standard deviations, and jumps lie within its cells.
-        assert mass == pytest.approx(1, abs=0.02)
-
-
-def test_base_density_is_the_gaussians() -> None:
-    snapshot = make_snapshot(PLANE, loc=torch.tensor([0.3, -1.0]), scale=torch.tensor([0.2, 1.5]))
-    drawn = base_log_density(snapshot, snapshot.latents)
-    torch.testing.assert_close(drawn, snapshot.latent_log_density)
 
 
 def test_samples_are_the_latents_through_the_stages() -> None:
@@ -91,12 +58,6 @@ def test_path_is_that_of_the_followed_sample() -> None:
     assert length(longest.path()) > length(snapshot.path())
 
 
-def test_allowed_share() -> None:
-    assert make_snapshot({}).allowed_share() == 1
-    snapshot = make_snapshot({"obstacle": PLANE["obstacle"]})
-    assert snapshot.allowed_share() == pytest.approx(1.5 * 1.4 / 4, abs=0.02)
-
-
 def test_random_numbers_elsewhere_are_left_alone() -> None:
     before = torch.random.get_rng_state()
     make_snapshot(PLANE)
@@ -107,3 +68,33 @@ def test_batch_of_states_is_refused() -> None:
     actor = torch.nn.Identity()
     with pytest.raises(ValueError, match=r"one state .* given \(3,\)"):
         take_snapshot(actor, TensorDict({}, [3]))  # type: ignore[arg-type]
+
+
+CASES = {
+    "no constraint": ({}, 2),
+    "three": (PLANE, 2),
+    "other families": (PLANE_OF_OTHERS, 2),
+    "one is dropped": (CONFLICT, 2),
+    "on a line": (LINE, 1),
+    "in space": (SPACE, 3),
+}
+
+
+@pytest.mark.parametrize("flow", ["exact", "gauge", "radial", "squash", "unconstrained"])
+@pytest.mark.parametrize("case", CASES)
+def test_stages_are_the_flows_up_to_each(case: str, flow: str) -> None:
+    sets, dim = CASES[case]
+    if flow == "squash" and case in ("other families", "in space"):
+        pytest.skip("some of these sets have no squash")
+    snapshot = make_snapshot(sets, flow, dim=dim)
+    applied = [stage.applied for stage in snapshot.stages]
+    staged = StagedFlow(snapshot.head.flow, snapshot.region, applied)
+    actions, log_dets = staged.forward(snapshot.latents)
+    latents, inverse_log_dets = staged.inverse(actions[-1])
+    for k, each in enumerate(applied):
+        bijector = stage_bijector(snapshot.head.flow, snapshot.region, each)
+        expected = bijector.forward_and_log_det(snapshot.latents)
+        torch.testing.assert_close((actions[k], log_dets[k]), expected, rtol=1e-5, atol=1e-5)
+        expected = bijector.inverse_and_log_det(actions[-1])
+        given = latents[k], inverse_log_dets[k]
+        torch.testing.assert_close(given, expected, rtol=1e-4, atol=1e-4, equal_nan=True)

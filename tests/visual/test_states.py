@@ -5,13 +5,12 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import GymEnv, TransformedEnv
 
-from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors
+from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors, find_task_view
 from cnfp_torchrl.geometry import Ball, Box, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import telling_states
-from cnfp_torchrl.visual.arena import layout_of
 from cnfp_torchrl.visual.states import openness
 
 ORDER = ["battery", "obstacle"]
@@ -41,7 +40,6 @@ def point_nav(layout: Layout) -> TransformedEnv:
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_point_navigation(layout: Layout) -> None:
     env = point_nav(layout)
-    assert layout_of(env) == layout
     head = head_of(env, ORDER)
     permissive, restrictive = telling_states(env, head)
 
@@ -92,7 +90,7 @@ def test_environment_without_a_map() -> None:
         GymEnv("Pendulum-v1"), {"gentle": SwingGently("gentle")}, order=["gentle"], with_anchor=True
     )
     env.set_seed(0)
-    assert layout_of(env) is None
+    assert find_task_view(env).map is None
     permissive, restrictive = telling_states(env, head_of(env, ["gentle"]), steps=60)
     assert permissive.batch_size == restrictive.batch_size == torch.Size()
     assert restrictive["observation"][2].abs() > 2 * permissive["observation"][2].abs()

@@ -123,12 +123,15 @@ class Ascent:
         self._look()
 
     def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
-        """Take steps until all points are deep enough or cannot be; tell which are, ``(*batch,)``.
+        """Take steps until all points are deep enough or cannot be, and tell which are.
 
         Args:
             steps: at most so many.
             share: of the best slack that will do.
             depth: the least slack that will do, ``(*batch,)``.
+
+        Returns:
+            Whether the points are deep enough, boolean ``(*batch,)``.
         """
         least = self._last(depth, 0)
         for step in range(steps + 1):

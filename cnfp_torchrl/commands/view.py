@@ -1,0 +1,112 @@
+"""Open a run's recording in a viewer, finished or growing: the command ``cnfp-view``."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cnfp_torchrl.commands.extras import needs_extra
+
+with needs_extra("rerun"):
+    from cnfp_torchrl.visual.rerun.follow import Follower, Lost, NotStarted, is_being_written
+    from cnfp_torchrl.visual.rerun.viewers import (
+        RunningViewer,
+        SinkError,
+        Viewer,
+        ViewerWindow,
+        WebViewer,
+        has_display,
+    )
+
+_FOLDERS = ("outputs", "multirun")
+
+
+def newest_recording(places: Sequence[str | Path]) -> Path:
+    """Return the recording that was written last.
+
+    Args:
+        places: recordings, or folders to look through.
+
+    Raises:
+        FileNotFoundError: when there is none.
+    """
+    found: list[Path] = []
+    for place in map(Path, places):
+        found += [place] if place.is_file() else place.rglob("*.rrd")
+    if not found:
+        looked = ", ".join(str(place) for place in places)
+        raise FileNotFoundError(
+            f"expected a recording, found none in {looked}; record one with: cnfp-train visual=file"
+        )
+    return max(found, key=lambda path: path.stat().st_mtime)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Open the newest recording, and return when the viewer is closed."""
+    parser = argparse.ArgumentParser(
+        prog="cnfp-view", description="Open a run's recording in a Rerun viewer."
+    )
+    parser.add_argument(
+        "run",
+        nargs="*",
+        default=_FOLDERS,
+        help="folder of a run, or a recording; the newest of several (default: of all runs here)",
+    )
+    parser.add_argument("--follow", action="store_true", help="show what a run still records, too")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--web", action="store_true", help="serve it to a browser instead")
+    where.add_argument("--connect", metavar="URL", help="show it in a viewer that runs already")
+    parser.add_argument("--memory-limit", default="2GiB", help="of the viewer (%(default)s)")
+    given = parser.parse_args(arguments)
+    try:
+        path = newest_recording(given.run)
+        viewer = _viewer(given)
+        viewer.require()
+        told = f", open {viewer.url} and end with Ctrl-C" if isinstance(viewer, WebViewer) else ""
+        sys.stdout.write(f"{path}{told}\n")
+        sys.stdout.flush()
+        status = _follow(path, viewer) if given.follow else _open(path, viewer)
+    except KeyboardInterrupt:
+        return
+    except (FileNotFoundError, SinkError, NotStarted, Lost) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    sys.exit(status)
+
+
+def _viewer(given: argparse.Namespace) -> Viewer:
+    if given.connect:
+        return RunningViewer(given.connect)
+    if given.web:
+        return WebViewer(memory_limit=given.memory_limit)
+    if not has_display():
+        raise SinkError(
+            "expected a display to open a window on; serve the recording to a browser instead, "
+            "with --web"
+        )
+    return ViewerWindow(memory_limit=given.memory_limit)
+
+
+def _open(path: Path, viewer: Viewer) -> int:
+    with path.open("rb") as file:
+        if is_being_written(file):
+            sys.stdout.write("a run still records it; see the rest, too, with --follow\n")
+            sys.stdout.flush()
+    command = viewer.command()
+    command = [*command, str(path)] if command else viewer.relay(str(path))
+    return subprocess.run(command, check=False).returncode
+
+
+def _follow(path: Path, viewer: Viewer) -> int:
+    follower = Follower(path, viewer.relay(), viewer.command(), viewer.addresses)
+    try:
+        follower.copy()
+        return 0 if follower.viewer is None else follower.viewer.wait()
+    finally:
+        follower.end()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""The figures of a finished run, without a viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.envs import find_task_view
+from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.environment import counted_constraints
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.visual.colors import constraint_colors
+from cnfp_torchrl.visual.explanation import explain
+from cnfp_torchrl.visual.figures.canvas import save_png
+from cnfp_torchrl.visual.figures.learning_curves import learning_curves, read_scalars
+from cnfp_torchrl.visual.figures.stages import flow_stages
+from cnfp_torchrl.visual.figures.trajectories import record_episodes, trajectories
+from cnfp_torchrl.visual.snapshot import FlowSnapshot, take_snapshot
+from cnfp_torchrl.visual.states import telling_states
+
+METRICS, FIGURES = "metrics", "figures"
+
+
+def draw_run_figures(
+    folder: RunFolder,
+    *,
+    trusted: Sequence[str] = (),
+    states: int = 256,
+    episodes: int = 6,
+    dpi: int = 130,
+) -> list[Path]:
+    """Draw a finished run's figures into its folder ``figures/``, and return the files.
+
+    ``learning_curves.png``; ``trajectories.png`` where the environment has a map; and, where the
+    actor is a constrained one, ``flow_permissive.png`` and ``flow_restrictive.png``.
+
+    Args:
+        folder: with configuration and checkpoint.
+        trusted: see `RunFolder.load_config`.
+        states: number looked at at once for telling ones.
+        episodes: number of those drawn.
+        dpi: dots per inch.
+    """
+    config = folder.load_config(trusted)
+    # A run that goes on after its figures draws the same random numbers as without them.
+    with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(config.seed)
+        figures = _figures(folder, config, states, episodes)
+    target = folder.path / FIGURES
+    return [save_png(figure, target / f"{name}.png", dpi=dpi) for name, figure in figures.items()]
+
+
+def _figures(
+    folder: RunFolder, config: DictConfig, states: int, episodes: int
+) -> dict[str, Figure]:
+    env = _environment(config, states)
+    actor = load_actor(folder, config, env)
+    head = flow_head(actor)
+    names = list(dict.fromkeys([*head.order, *counted_constraints(env)]))
+    colors = constraint_colors(names)
+    run = f"{type(head.flow).__name__}, seed {config.seed}"
+    curves = learning_curves(
+        read_scalars(folder.path / METRICS), colors=colors, title=f"Learning curves · {run}"
+    )
+    figures = {"learning_curves": curves}
+    view = find_task_view(env)
+    if view.map is not None:
+        figures["trajectories"] = _trajectories(_environment(config, episodes), actor, colors)
+    if not head.flow.has_density:
+        return figures  # the stages of a flow are drawn with their densities
+    for kind, state in zip(("permissive", "restrictive"), telling_states(env, head), strict=True):
+        snapshot = take_snapshot(actor, state, seed=config.seed)
+        if kind == "restrictive":
+            snapshot = snapshot.following_the_longest_path()
+        title = f"{kind.capitalize()} state{_openness(snapshot)} · {run}"
+        figures[f"flow_{kind}"] = flow_stages(snapshot, view=view, colors=colors, title=title)
+    return figures
+
+
+def _trajectories(
+    env: TransformedEnv, actor: SafeProbabilisticTensorDictSequential, colors: dict[str, str]
+) -> Figure:
+    episodes = record_episodes(env, actor)
+    title = "Evaluation episodes of the stochastic policy"
+    return trajectories(
+        find_task_view(env), episodes, counted_constraints(env), colors=colors, title=title
+    )
+
+
+def _environment(config: DictConfig, batch: int) -> TransformedEnv:
+    env = build_environment(config, batch_size=[batch], with_anchor=True)
+    env.set_seed(config.evaluation.seed)
+    return env
+
+
+def _openness(snapshot: FlowSnapshot) -> str:
+    share, told = explain(snapshot).share_allowed, ""
+    if share is not None:
+        told = f": {'all' if share == 1 else f'{100 * share:.0f} % of'} actions allowed"
+    dropped = " and ".join(snapshot.dropped)
+    return f"{told}, {dropped} cannot hold" if dropped else told

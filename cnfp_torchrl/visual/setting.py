@@ -1,0 +1,185 @@
+"""What the pictures of all steps of a policy have in common: stages, limits, colors, titles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from cnfp_torchrl.envs import TaskView, find_task_view
+from cnfp_torchrl.modules import ConstrainedFlowModule
+from cnfp_torchrl.training.environment import counted_constraints
+from cnfp_torchrl.visual.colors import constraint_colors
+from cnfp_torchrl.visual.snapshot import FlowSnapshot
+
+_MARGIN = 1.1
+_MARGIN_OF_CHAINS = 1.6
+"""A chain of squashes leaves the action bounds before its last stage."""
+
+
+class StageView(NamedTuple):
+    """One view of one stage.
+
+    Args:
+        stage: index of the stage.
+        components: of the action that the view shows, one or two, counted from 0.
+        title: of the view.
+    """
+
+    stage: int
+    components: tuple[int, ...]
+    title: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the scenes of a flow policy have in common.
+
+    Args:
+        stages: names of the flow's stages in order of application.
+        constraints: names of the constraints in order of application.
+        low: lower action bounds.
+        high: upper action bounds.
+        projections: pairs of components, one row of views for each; none in one dimension.
+        view: what the task shows of itself.
+        costs: names of the columns of ``cost``; none where the environment counts nothing.
+        reach: how far views extend, in half widths of the action bounds.
+        leaves_bounds: whether there can be actions outside the bounds before the last stage.
+    """
+
+    stages: tuple[str, ...]
+    constraints: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    projections: tuple[tuple[int, int], ...]
+    view: TaskView
+    costs: tuple[str, ...]
+    reach: float
+    leaves_bounds: bool
+
+    @classmethod
+    def of(
+        cls,
+        head: ConstrainedFlowModule,
+        env: EnvBase | None = None,
+        projections: Sequence[Sequence[int]] | None = None,
+    ) -> Setting:
+        """Return the setting of a policy.
+
+        Args:
+            head: its flow module.
+            env: shows its task and says what the costs are called; None: neither.
+            projections: pairs of action components, each a row of views; None shows the first two.
+
+        Raises:
+            ValueError: when a projection does not name two different components of the action, or
+                when the flow has no density.
+        """
+        if not head.flow.has_density:
+            raise ValueError(
+                "actor: expected a flow with a density, such as flow=exact, given "
+                f"{type(head.flow).__name__}, whose stages have none to draw"
+            )
+        leaves_bounds = head.flow.reads_constraints and not head.flow.is_safe
+        return cls(
+            stages=tuple(head.stage_names),
+            constraints=tuple(head.order),
+            low=tuple(head.bounds.low.tolist()),
+            high=tuple(head.bounds.high.tolist()),
+            projections=_projections(head.action_dim, projections),
+            view=find_task_view(env),
+            costs=() if env is None else counted_constraints(env),
+            reach=_MARGIN_OF_CHAINS if leaves_bounds else _MARGIN,
+            leaves_bounds=leaves_bounds,
+        )
+
+    def holding(self, snapshot: FlowSnapshot, view: TaskView) -> Setting:
+        """Return this setting with another view of the task, reaching to all samples."""
+        bounds = snapshot.region.bounds
+        samples = torch.stack([stage.samples for stage in snapshot.stages]).flatten(0, 1)
+        middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
+        farthest = 1.05 * float(((samples - middle) / half).abs().max())
+        return replace(self, view=view, reach=max(self.reach, farthest))
+
+    @property
+    def dim(self) -> int:
+        """The dimension d of the action space."""
+        return len(self.low)
+
+    @cached_property
+    def colors(self) -> Mapping[str, str]:
+        """The constraints' colors, those of all figures."""
+        return constraint_colors(self.constraints)
+
+    @cached_property
+    def limits(self) -> tuple[tuple[float, float], ...]:
+        """The part of the action space that the views show, for each component."""
+        ends = []
+        for low, high in zip(self.low, self.high, strict=True):
+            middle, half = (low + high) / 2, (high - low) / 2
+            ends.append((middle - self.reach * half, middle + self.reach * half))
+        return tuple(ends)
+
+    @property
+    def support(self) -> tuple[tuple[float, float], ...]:
+        """The part of the views in which there can be a density, for each component."""
+        ends = tuple(zip(self.low, self.high, strict=True))
+        return self.limits if self.leaves_bounds else ends
+
+    def rows(self) -> list[list[StageView]]:
+        """Return the views, a row for each projection, stages from left to right."""
+        rows = []
+        for components in self.projections or ((0,),):
+            row = []
+            for index, name in enumerate(self.stages):
+                title = f"{index + 1} · {'action bounds' if name == 'bounds' else name}"
+                if index > 0 and index + 1 == len(self.stages):
+                    title = f"{title}, highest priority"
+                if self.dim > 2:
+                    title = f"{title} ({pair_name(components)})"
+                row.append(StageView(index, tuple(components), title))
+            rows.append(row)
+        return rows
+
+    def grid(self, cells: int) -> Tensor:
+        """Return the middles of equal cells over the support.
+
+        ``(4 * cells, 1)`` in one dimension and, the second component first, ``(cells, cells, 2)``
+        in two.
+        """
+        count = cells if self.dim == 2 else 4 * cells
+        share = (torch.arange(count) + 0.5) / count
+        axes = [low + (high - low) * share for low, high in self.support]
+        # One component after the other in memory: to add up two neighbors takes thrice as long.
+        return torch.stack(torch.meshgrid(*axes, indexing="xy")).movedim(0, -1)
+
+
+def pair_name(components: Sequence[int]) -> str:
+    """Return what two components of the action are called, counted from 1."""
+    return ", ".join(f"a{component + 1}" for component in components)
+
+
+def _projections(
+    dim: int, projections: Sequence[Sequence[int]] | None
+) -> tuple[tuple[int, int], ...]:
+    if dim == 1:
+        if projections:
+            raise ValueError(
+                f"projections: expected none for an action of one component, given {projections}"
+            )
+        return ()
+    chosen = [(0, 1)] if projections is None else [tuple(each) for each in projections]
+    for pair in chosen:
+        if len(pair) != 2 or len(set(pair)) != 2 or not all(0 <= c < dim for c in pair):
+            raise ValueError(
+                f"projections: expected pairs of two different components in 0..{dim - 1}, "
+                f"given {pair}"
+            )
+    if not chosen or len(set(chosen)) != len(chosen):
+        raise ValueError(f"projections: expected at least one pair, each once, given {chosen}")
+    return tuple((int(first), int(second)) for first, second in chosen)

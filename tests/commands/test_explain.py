@@ -1,0 +1,103 @@
+"""``cnfp-explain`` on a real run."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from cnfp_torchrl.commands.explain import explain_run, main
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.callbacks import replay_episodes
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.settings import EvaluationSettings
+from cnfp_torchrl.training.train import train
+
+TINY = [
+    "collector.total_frames=64",
+    "training.warmup_frames=64",
+    "training.update_ratio=0.05",
+    "evaluation.episodes=3",
+    "+env.base.max_steps=8",
+    "logger=none",
+]
+
+
+@pytest.fixture(scope="module")
+def make_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
+    made: dict[tuple[str, ...], RunFolder] = {}
+
+    def make(*overrides: str) -> RunFolder:
+        if overrides not in made:
+            folder = RunFolder.create(tmp_path_factory.mktemp("run"))
+            with initialize_config_dir(str(config_directory()), version_base="1.3"):
+                train(compose("train", overrides=[*TINY, *overrides]), folder)
+            made[overrides] = folder
+        return made[overrides]
+
+    return make
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
+def test_every_flow_is_explained(flow: str, make_run: Callable[..., RunFolder]) -> None:
+    said = explain_run(make_run(f"flow={flow}"), step=2)
+    assert said.startswith("Step 2 of 8, episode 0, seed 1000, stochastic policy\n")
+    for words in ("battery: ", "obstacle: ", "steps are left above 20 %", "Reward "):
+        assert words in said
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_step_is_that_of_the_evaluation(
+    deterministic: bool, make_run: Callable[..., RunFolder]
+) -> None:
+    folder = make_run("flow=exact")
+    said = explain_run(folder, step=5, episode=2, seed=11, deterministic=deterministic)
+    config = folder.load_config()
+    env = build_environment(config, batch_size=[3], with_anchor=True)
+    settings = EvaluationSettings(3, 11)
+    (steps,) = replay_episodes(env, load_actor(folder, config, env), settings, [2], deterministic)
+    x, y, *_ = steps[5]["observation"].tolist()
+    assert f"At ({x:.3f}, {y:.3f})" in said
+    action = ", ".join(f"{value:.3f}" for value in steps[5]["action"].tolist())
+    assert re.search(rf"^action +\({re.escape(action)}\)", said, re.MULTILINE)
+    assert f"Reward {float(steps[5]['next', 'reward']):.3f}" in said
+
+
+def test_the_command_prints_it(
+    make_run: Callable[..., RunFolder], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_run("flow=exact")
+    main([str(folder.path), "--step", "7", "--episode", "1"])
+    assert capsys.readouterr().out == explain_run(folder, step=7, episode=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--step", "8"], "--step: expected a number from 0 to 7, the last of episode 0, given 8"),
+        (["--step", "-1"], "--step: expected a number >= 0, given -1"),
+        (["--step", "0", "--episode", "3"], "--episode: expected a number from 0 to 2, given 3"),
+        (["--step", "0", "--episodes", "0"], "evaluation.episodes: expected a whole number >= 1"),
+        (["--step", "few"], "invalid int value: 'few'"),
+        ([], "--step"),
+    ],
+)
+def test_wrong_input_is_explained(
+    arguments: list[str],
+    message: str,
+    make_run: Callable[..., RunFolder],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(make_run("flow=exact").path), *arguments])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_missing_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "absent"), "--step", "0"])
+    assert ended.value.code == 2
+    assert f"{tmp_path / 'absent'} lacks" in capsys.readouterr().err

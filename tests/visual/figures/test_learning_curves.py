@@ -1,0 +1,112 @@
+"""Learning curves show what was logged, and say what was not."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from torchrl.record.loggers import CSVLogger
+
+from cnfp_torchrl.visual import constraint_colors
+from cnfp_torchrl.visual.figures import learning_curves, read_scalars
+
+STEPS = [500, 1000, 1500]
+LOGGED = {
+    "train/return": [-90.0, -50.0, 3.5],
+    "train/steps_per_second": [100.0, 90.0, 80.0],
+    "train/alpha": [1.0, 0.8, 0.7],
+    "train/entropy": [1.4, 1.2, 1.1],
+    "loss/actor": [0.3, 0.1, -0.4],
+    "loss/qvalue": [2.0, 1.0, 0.5],
+    "violations/obstacle": [4.0, 60.0, 592.0],
+    "violations/battery": [0.0, 7.0, 1040.0],
+}
+
+
+@pytest.fixture
+def metrics(tmp_path: Path) -> Path:
+    logger = CSVLogger("metrics", str(tmp_path))
+    for name, values in LOGGED.items():
+        for step, value in zip(STEPS, values, strict=True):
+            logger.log_scalar(name, value, step=step)
+    return tmp_path / "metrics"
+
+
+def texts(figure: Figure) -> str:
+    return " ".join(text.get_text() for text in figure.findobj() if hasattr(text, "get_text"))
+
+
+def test_scalars_are_read_back(metrics: Path) -> None:
+    curves = read_scalars(metrics)
+    assert set(curves) == set(LOGGED)
+    for name, values in LOGGED.items():
+        np.testing.assert_allclose(curves[name], [STEPS, values])
+
+
+def test_missing_folder_has_no_scalars(tmp_path: Path) -> None:
+    assert read_scalars(tmp_path / "metrics") == {}
+
+
+def test_empty_file_is_no_curve(metrics: Path) -> None:
+    (metrics / "scalars" / "empty.csv").write_text("\n")
+    assert "empty" not in read_scalars(metrics)
+
+
+@pytest.mark.parametrize("content", ["1,2,3\n", "step,value\n", "1,2\n3\n"])
+def test_broken_file_is_named(metrics: Path, content: str) -> None:
+    path = metrics / "scalars" / "broken.csv"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"step,value") as error:
+        read_scalars(metrics)
+    assert str(path) in str(error.value)
+
+
+def test_every_curve_is_drawn_as_logged(metrics: Path, draws: Callable[[Figure], bool]) -> None:
+    figure = learning_curves(read_scalars(metrics), title="a title")
+    drawn = [line.get_ydata() for axes in figure.axes for line in axes.lines]
+    for name, values in LOGGED.items():
+        found = any(np.array_equal(values, each) for each in drawn)
+        assert found == (name != "train/steps_per_second"), name
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:2] == ["mean return of an episode", "violations since the start"]
+    assert {"critic loss", "actor loss", "policy entropy (nats)"} < set(titles)
+    assert len(titles) == len(set(titles))
+    assert draws(figure)
+
+
+def test_violations_have_their_constraints_color_and_total(metrics: Path) -> None:
+    axes = learning_curves(read_scalars(metrics)).axes[1]
+    colors = constraint_colors(["battery", "obstacle"])
+    assert {line.get_label(): line.get_color() for line in axes.lines} == {
+        "battery: 1,040": colors["battery"],
+        "obstacle: 592": colors["obstacle"],
+    }
+
+
+def test_coinciding_zeros_stay_visible() -> None:
+    zero = (np.array([1.0, 2.0]), np.zeros(2))
+    axes = learning_curves({"violations/battery": zero, "violations/obstacle": zero}).axes[1]
+    first, second = axes.lines
+    assert first.get_linewidth() > second.get_linewidth()
+    low, high = axes.get_ylim()
+    assert low < 0 < 1 <= high
+
+
+def test_run_without_metrics_says_so(draws: Callable[[Figure], bool]) -> None:
+    figure = learning_curves({})
+    assert "logger=csv" in texts(figure)
+    assert draws(figure)
+
+
+def test_missing_return_and_counts_are_said(draws: Callable[[Figure], bool]) -> None:
+    figure = learning_curves({"loss/actor": (np.array([5.0]), np.array([1.0]))})
+    assert "no episode ended" in texts(figure)
+    assert "none counted" in texts(figure)
+    assert draws(figure)
+
+
+def test_single_entry_is_visible() -> None:
+    figure = learning_curves({"train/return": (np.array([5.0]), np.array([1.0]))})
+    (line,) = figure.axes[0].lines
+    assert line.get_marker() == "o"

@@ -1,0 +1,151 @@
+"""The pictures of flow stages show the policy's own stages, samples and sets."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.path import Path as Polygon
+
+from cnfp_torchrl.geometry import ConstraintSet
+from cnfp_torchrl.visual import FlowSnapshot, constraint_colors
+from cnfp_torchrl.visual.figures import flow_stages
+from tests.visual.cases import (
+    CONFLICT,
+    LINE,
+    PLANE,
+    PLANE_OF_OTHERS,
+    SPACE,
+    first,
+    make_snapshot,
+)
+
+FLOWS = ["exact", "radial", "squash", "unconstrained"]
+
+
+def stage_panels(figure: Figure, snapshot: FlowSnapshot) -> list[Axes]:
+    panels = [axes for axes in figure.axes if axes.get_title().startswith("stage ")]
+    assert len(panels) == len(snapshot.stages)
+    return panels
+
+
+def drawn(axes: Axes, label: str) -> np.ndarray:
+    """Return the points of all lines with a label."""
+    lines = [line.get_xydata() for line in axes.lines if line.get_label() == label]
+    return np.concatenate(lines)
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+@pytest.mark.parametrize("count", range(4))
+def test_a_panel_for_each_stage(count: int, flow: str, draws: Callable[[Figure], bool]) -> None:
+    snapshot = make_snapshot(first(PLANE, count), flow)
+    figure = flow_stages(snapshot)
+    titles = [axes.get_title().split("\n")[0] for axes in stage_panels(figure, snapshot)]
+    names = {
+        "exact": ["action bounds", *first(PLANE, count)],
+        "radial": ["action bounds", *first(PLANE, count)],
+        "squash": list(first(PLANE, count)) or ["action bounds"],
+        "unconstrained": ["action bounds"],
+    }[flow]
+    assert titles == [f"stage {i}: {name}" for i, name in enumerate(names, start=1)]
+    assert draws(figure)
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial"])
+@pytest.mark.parametrize("sets", [PLANE, PLANE_OF_OTHERS, CONFLICT])
+def test_all_samples_lie_inside_the_drawn_set(sets: dict[str, ConstraintSet], flow: str) -> None:
+    snapshot = make_snapshot(sets, flow, samples=1000)
+    for axes in stage_panels(flow_stages(snapshot), snapshot):
+        so_far = Polygon(drawn(axes, "set so far"))
+        samples = drawn(axes, "samples")
+        assert len(samples) == 1000
+        # Saturated samples lie on the edge, which is drawn as a polygon.
+        assert so_far.contains_points(samples, radius=1e-3).all()
+        assert "0 of 1000" in axes.get_title()
+
+
+@pytest.mark.parametrize("flow", ["squash", "unconstrained"])
+def test_samples_outside_are_marked_and_counted(flow: str) -> None:
+    snapshot = make_snapshot(PLANE, flow, samples=1000)
+    last = stage_panels(flow_stages(snapshot), snapshot)[-1]
+    outside = drawn(last, "outside")
+    broken = ~snapshot.region.contains(torch.tensor(outside))
+    assert 0 < len(outside) < 1000
+    assert broken.all()
+    assert last.get_title().endswith(f"{len(outside)} of 1000 break a constraint")
+    assert snapshot.region.contains(torch.tensor(drawn(last, "samples"))).all()
+
+
+def test_constraints_keep_their_colors_in_every_panel() -> None:
+    sets = {**PLANE, **PLANE_OF_OTHERS}
+    colors = constraint_colors(sets)
+    for names in (["battery", "visible"], ["power", "obstacle"]):
+        snapshot = make_snapshot({name: sets[name] for name in names})
+        figure = flow_stages(snapshot, colors=colors)
+        for axes in stage_panels(figure, snapshot):
+            for name in names:
+                shown = {ln.get_color() for ln in axes.lines if ln.get_label() == name}
+                assert shown == {colors[name]}
+        legend = {text.get_text() for text in figure.legends[0].get_texts()}
+        assert {f"{name} set" for name in names} < legend
+
+
+def test_sets_not_yet_applied_are_dotted() -> None:
+    snapshot = make_snapshot(first(PLANE, 2))
+    panels = stage_panels(flow_stages(snapshot), snapshot)
+    solid = [
+        {
+            ln.get_label()
+            for ln in axes.lines
+            if ln.get_label() in PLANE and ln.get_linestyle() == "-"
+        }
+        for axes in panels
+    ]
+    assert solid == [set(), {"battery"}, {"battery", "obstacle"}]
+
+
+def test_dropped_constraint_is_told_and_dotted() -> None:
+    snapshot = make_snapshot(CONFLICT)
+    far = stage_panels(flow_stages(snapshot), snapshot)[1]
+    assert "far (dropped here)" in far.get_title()
+    assert all(ln.get_linestyle() != "-" for ln in far.lines if ln.get_label() == "far")
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_one_action_component(flow: str, draws: Callable[[Figure], bool]) -> None:
+    snapshot = make_snapshot(LINE, flow, dim=1)
+    figure = flow_stages(snapshot)
+    for axes in stage_panels(figure, snapshot):
+        (curve,) = (ln for ln in axes.lines if ln.get_label() == "density")
+        x, density = curve.get_data()
+        assert np.trapezoid(density, x) == pytest.approx(1, abs=0.02)
+    assert draws(figure)
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial", "unconstrained"])
+def test_three_action_components(flow: str, draws: Callable[[Figure], bool]) -> None:
+    snapshot = make_snapshot(SPACE, flow, dim=3)
+    figure = flow_stages(snapshot)
+    assert "first two of 3" in figure.get_suptitle()
+    for axes in stage_panels(figure, snapshot):
+        # Rays that miss a corner cut it off by some thousandths.
+        shadow = Polygon(drawn(axes, "set so far"))
+        inside = axes.collections[0].get_offsets()
+        assert shadow.contains_points(inside, radius=1e-2).all()
+    assert draws(figure)
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_saturated_policies_are_drawn(flow: str, draws: Callable[[Figure], bool]) -> None:
+    loc, scale = torch.tensor([1e6, -1e6]), torch.tensor([1e-8, 1e4])
+    assert draws(flow_stages(make_snapshot(PLANE, flow, loc=loc, scale=scale)))
+
+
+def test_followed_action_is_drawn_through_the_stages() -> None:
+    snapshot = make_snapshot(PLANE).following_the_longest_path()
+    path = snapshot.path().numpy()
+    for i, axes in enumerate(stage_panels(flow_stages(snapshot), snapshot)):
+        (now,) = (line for line in axes.lines if line.get_marker() == "D")
+        np.testing.assert_allclose(now.get_xydata(), path[i : i + 1])

@@ -1,0 +1,88 @@
+"""Recordings of made-up steps, and their content read back."""
+
+import subprocess
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun_cli
+import torch
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+from tensordict import TensorDictBase
+
+from cnfp_torchrl.geometry import ConstraintSet
+from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.visual.rerun import FlowStream, flow_blueprint
+from tests.visual.cases import make_actor, make_state
+
+RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+
+
+def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
+    """Write a recording to a file and close it."""
+    stream = rr.RecordingStream("tests", recording_id="tests", send_properties=False)
+    stream.save(path)
+    write(stream)
+    stream.flush(timeout_sec=10)
+    stream.disconnect()
+    return path
+
+
+def record_steps(
+    path: Path,
+    sets: Mapping[str, ConstraintSet],
+    flow: str = "exact",
+    *,
+    dim: int = 2,
+    steps: int = 2,
+    projections: list[tuple[int, int]] | None = None,
+) -> list[TensorDictBase]:
+    """Stream a policy in one state and return its steps."""
+    actor = make_actor(sets, flow, dim=dim, loc=torch.full((dim,), 0.2))
+    state = make_state(sets, dim)
+    taken = []
+    for step in range(steps):
+        transition = actor(state.clone())
+        transition["next", "reward"] = torch.tensor([float(step)])
+        taken.append(transition)
+    assert flow_head(actor).order == list(sets)
+
+    def write(stream: rr.RecordingStream) -> None:
+        stream.send_blueprint(flow_blueprint(actor, projections=projections))
+        flow_stream = FlowStream(stream, actor, projections=projections, samples=64)
+        for step, transition in enumerate(taken):
+            flow_stream.log_step(step, transition)
+
+    record(path, write)
+    return taken
+
+
+def read(path: Path, entity: str, component: str) -> dict[int, NDArray[np.float64]]:
+    """Return a component of an entity by step, each as an array; -1 for what is static.
+
+    Lines of different lengths become an array of arrays.
+    """
+    found = {}
+    for chunk in RrdReader(str(path)).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if component not in batch.schema.names:
+            continue
+        values = batch.column(component).to_pylist()
+        static = "env_step" not in batch.schema.names
+        steps = [-1] * len(values) if static else batch.column("env_step").to_pylist()
+        for step, value in zip(steps, values, strict=True):
+            found[step] = np.array(value, dtype=object if _is_ragged(value) else None)
+    return found
+
+
+def _is_ragged(value: list[object]) -> bool:
+    return len({len(each) for each in value if isinstance(each, list)}) > 1
+
+
+def compare(one: Path, other: Path) -> subprocess.CompletedProcess[str]:
+    """Compare two recordings by Rerun's own command."""
+    return subprocess.run(
+        [RERUN, "rrd", "compare", str(one), str(other)], capture_output=True, text=True, check=False
+    )
