@@ -98,7 +98,7 @@ class FlowSnapshot:
 
     def is_active(self, index: int) -> bool:
         """Tell whether ``region.sets[index]`` holds in this state."""
-        return _is_active(self.region, index)
+        return bool(self.region.is_active[index])
 
     @cached_property
     def contained(self) -> Tensor:
@@ -201,7 +201,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
             actions[i],
             latent_log_density - log_dets[i],
             sets,
-            _is_active(on_host, sets[-1]),
+            bool(on_host.is_active[sets[-1]]),
         )
         for i, (name, sets) in enumerate(applied)
     )
@@ -230,10 +230,6 @@ def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, 
     """Return each stage's name with the indices of the sets applied so far."""
     index = {"bounds": 0} | {name: k for k, name in enumerate(order, 1)}
     return [(name, tuple(index[n] for n in stages[: i + 1])) for i, name in enumerate(stages)]
-
-
-def _is_active(region: Region, index: int) -> bool:
-    return region.active is None or bool(region.active[index])
 
 
 class StagedFlow:
