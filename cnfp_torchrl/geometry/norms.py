@@ -15,7 +15,8 @@ def power_of_two(size: Tensor) -> Tensor:
     """
     size = size.detach()
     mantissa, _ = torch.frexp(size)
-    return (size / (2 * mantissa)).nan_to_num(1.0)
+    # 0 by itself, not by 0/0, which is NaN only where no rounding has touched the mantissa.
+    return (size / (2 * mantissa)).nan_to_num(1.0).masked_fill(size == 0, 1.0)
 
 
 def length(vector: Tensor) -> Tensor:
