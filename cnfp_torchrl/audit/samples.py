@@ -59,8 +59,7 @@ class Samples:
     @property
     def active(self) -> Tensor:
         """Which constraints are active in which state, ``(n, K)``."""
-        assert self.region.active is not None
-        return self.region.active[..., 1:]
+        return self.region.is_active[..., 1:]
 
     def describe(self, row: int, state: int) -> dict[str, Any]:
         """Return one action in its state as plain values."""
@@ -131,8 +130,7 @@ def describe_state(
 ) -> dict[str, Any]:
     """Return a state ``()`` as plain values: its entries, and each constraint's set."""
     region = head.get_region(state)
-    assert region.active is not None
-    flags = region.active[1:].tolist()
+    flags = region.is_active[1:].tolist()
     return {
         "state": {_name(key): plain(state.get(key)) for key in keys},
         "sets": {
