@@ -314,11 +314,12 @@ class TaskSpaceBall(ConstraintSet):
 
 
 def _image_gauge(jacobian: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
-    image = _image(jacobian, direction)
-    # In J's null space the set has no end. A direction whose image vanishes when squared is given
-    # another one there, so that nothing becomes NaN.
+    unit = power_of_two(direction.abs().amax(-1))
+    image = _image(jacobian, direction / unit.unsqueeze(-1))
+    # In J's null space the set has no end. A direction whose image vanishes when squared, beside
+    # its own length and J's norm, is given another one there, so that nothing becomes NaN.
     vanishes = image.abs().amax(-1) < torch.finfo(image.dtype).tiny ** 0.5
-    return of_ball(image + vanishes.unsqueeze(-1)).masked_fill(vanishes, 0)
+    return unit * of_ball(image + vanishes.unsqueeze(-1)).masked_fill(vanishes, 0)
 
 
 def _image(jacobian: Tensor, vector: Tensor) -> Tensor:

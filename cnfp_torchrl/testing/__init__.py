@@ -13,7 +13,7 @@ Of fields and shapes:
 Of slack and containment, and of what the search for anchors is told:
 
 - `check_slack_at_the_anchor`, `check_contains_agrees_with_slack`, `check_contains_is_exact`,
-- `check_slack_bounds_the_distance`: no action nearer than the slack is outside,
+- `check_slack_bounds_the_distance`: no action nearer than the slack is on the other side,
 - `check_slack_is_concave`: with the right gradient, unless `superlevel` is stated,
 - `check_superlevel`: it describes no more than the set, and all of a convex one,
 - `check_search_keeps_the_set`: what holds is not dropped,
@@ -21,7 +21,7 @@ Of slack and containment, and of what the search for anchors is told:
 
 Of gauges, about the given anchor and about others near the boundary, where arithmetic is worst:
 
-- `check_gauge_is_where_rays_leave`: by steps along the ray, judged by `contains`,
+- `check_gauge_is_where_rays_leave`: by steps along rays, judged by `contains`,
 - `check_gauge_is_homogeneous`, `check_gauge_about`,
 - `check_gauge_in_float32`: the exit misses the boundary by rounding errors alone,
 - `check_gauge_gradient_is_finite`, `check_gauge_gradient`: against finite differences.
@@ -30,7 +30,7 @@ Of what flows need:
 
 - `check_erosion_covers_rounding`, `check_erosion_is_small`: enough is taken away, and not too much,
 - `check_flow_stays_inside`: saturated float32 and float64 samples, with zero tolerance,
-- `check_log_det`: it is autograd's,
+- `check_log_det`: a flow's log-determinant is autograd's,
 - `check_around_contains_the_ball`, `check_dropped_sets_do_not_bind`,
 - `check_field_range`: fields over the whole range of float32 and float64.
 """

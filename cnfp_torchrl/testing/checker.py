@@ -1,4 +1,4 @@
-"""The checker of families, and the order of its checks."""
+"""The checker of families of sets, and the order of its checks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cnfp_torchrl.geometry import Box, ConstraintSet
 from cnfp_torchrl.testing import flows, gauges, ranges, shapes, slacks
 from cnfp_torchrl.testing.example import Example
 
-# Each check may rely on what those before it have found to be right.
+# Ordered: a check relies on what those before it have found to be right.
 OF_SHAPES = (
     shapes.check_event_dims,
     shapes.check_invalid_fields,
@@ -55,14 +55,13 @@ def check_constraint_set(
     """Check that a family of sets keeps the contract of `ConstraintSet`, by an example.
 
     Args:
-        sets: a batch of different sets of the family, float32 or float64; of their numbers those
-            count that float32 holds.
-        anchor: a point well inside each set, ``(*batch, d)``; best not its middle. A set that is
-            not convex must be star-shaped about it.
+        sets: batch of different sets of the family, in float32 or float64, rounded to float32.
+        anchor: points well inside the sets, ``(*batch, d)``, best not their middles. A set that is
+            not convex must be star-shaped about its anchor.
         bounds: finite action bounds that hold the anchors and are wider than the sets in some
             directions; by default some times wider than the sets are where they are narrow.
-        samples: directions from each of the anchors, the given one and four near the boundary.
-        seed: of the checker's own random numbers; the global ones are left alone.
+        samples: number of directions from each anchor: the given one and four near the boundary.
+        seed: seed of the checker's own random numbers; the global generator is left alone.
 
     Raises:
         FamilyError: naming family, method, batch element with its fields, direction or action, what

@@ -20,9 +20,9 @@ class FamilyError(AssertionError):
     """A family of sets that breaks the contract of `ConstraintSet`.
 
     Args:
-        family: the class.
-        method: the method, or `event_dims`, that is wrong.
-        problem: what was expected and given, and where.
+        family: class of the sets.
+        method: name of the method that is wrong, or ``"event_dims"``.
+        problem: sentence with the expected, the given, and where.
     """
 
     def __init__(self, family: type[ConstraintSet], method: str, problem: str) -> None:
@@ -42,13 +42,13 @@ def require(
     """Raise an error about the first case in which something does not hold.
 
     Args:
-        sets: of batch shape ``(B,)``.
-        method: the one that is wrong where it does not hold.
-        holds: boolean ``(*sample, B)``.
-        expected: in words.
-        quantity: the name of what is given.
-        given: its values, ``(*sample, B)``.
-        at: by name, where that is: ``(*sample, B, d)``, or broadcasting to it.
+        sets: sets of batch shape ``(B,)``.
+        method: name of the method that is wrong where something does not hold.
+        holds: flags, boolean ``(*sample, B)``.
+        expected: words for what should hold.
+        quantity: words for the values given.
+        given: values to show beside the expected, ``(*sample, B)``.
+        at: names and values of the points concerned, ``(*sample, B, d)`` or broadcasting to it.
 
     Raises:
         FamilyError: naming the batch element with its fields, and where it fails.
@@ -71,7 +71,7 @@ def require(
 
 
 def called(family: type[ConstraintSet], method: str, call: Callable[[], T]) -> T:
-    """Return what a call returns; what it raises becomes an error that names the method.
+    """Return what a call returns, with its exceptions turned into an error that names the method.
 
     Raises:
         FamilyError: naming the method, from what it raised.
@@ -85,7 +85,7 @@ def called(family: type[ConstraintSet], method: str, call: Callable[[], T]) -> T
 
 
 def shown(value: Tensor) -> str:
-    """Return a tensor's numbers in words, the first ones where there are many."""
+    """Return a tensor as text, of its first numbers where there are many."""
     numbers = [f"{number:.9g}" for number in value.detach().flatten()[:_LONGEST].tolist()]
     if value.ndim == 0:
         return numbers[0]

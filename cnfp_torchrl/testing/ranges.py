@@ -18,33 +18,33 @@ _DECADES = {torch.float32: 30.0, torch.float64: 140.0}
 
 
 def check_field_range(example: Example) -> None:
-    """Fields scaled log-uniformly over the dtype's range give numbers, and flows that stay inside.
+    """Fields scaled over the dtype's whole range give numbers, and flows that stay inside.
 
-    Each field alone, all by one factor, and all by factors of their own; sets that are no longer
-    valid, or no longer hold the anchor with room to spare, count no further.
+    Fields are scaled one alone, all by one factor, and all by factors of their own. Sets that are
+    invalid then, or no longer hold the anchor with room to spare, do not count.
     """
     for dtype in DTYPES:
         bounds, sets = example.cast(dtype)
-        view = example.views[0].cast(dtype)
+        rays = example.rays[0].cast(dtype)
         for scaled in _scaled(example, sets):
             valid = _valid(scaled)
-            slack = scaled.slack(view.anchor)
-            gauge = scaled.gauge(view.ways, view.anchor)
-            at = {"anchor": view.anchor}
+            slack = scaled.slack(rays.anchor)
+            gauge = scaled.gauge(rays.directions, rays.anchor)
+            at = {"anchor": rays.anchor}
             require(scaled, "slack", ~valid | ~slack.isnan(), "a number", "it", slack, **at)
-            inside = (slack > 0) & ~scaled.contains(view.anchor) & valid
+            inside = (slack > 0) & ~scaled.contains(rays.anchor) & valid
             clear = slack.abs() > 1e-3 * example.size.to(dtype)
             expected = "an anchor inside where its slack is positive"
             require(scaled, "contains", ~(inside & clear), expected, "a slack of", slack, **at)
             eroded = called(type(scaled), "eroded", partial(scaled.eroded, bounds.magnitude()))
-            roomy = valid & (eroded.slack(view.anchor) > 1e-2 * example.size.to(dtype))
+            roomy = valid & (eroded.slack(rays.anchor) > 1e-2 * example.size.to(dtype))
             expected = "a gauge of 0 or more, and no NaN"
             holds = ~roomy | (gauge >= 0)
-            require(scaled, "gauge", holds, expected, "it", gauge, direction=view.ways, **at)
-            # Elsewhere the family's own substitute for a dropped set stands.
+            require(scaled, "gauge", holds, expected, "it", gauge, direction=rays.directions, **at)
+            # Dropped elsewhere, not left out: the family's substitute for it is checked as well.
             active = torch.stack([torch.ones_like(roomy), roomy], -1)
-            flow = GaugeSquash(Region((bounds, scaled), view.anchor, active))
-            latent = example.normal(len(view.ways), *view.anchor.shape).to(dtype)
+            flow = GaugeSquash(Region((bounds, scaled), rays.anchor, active))
+            latent = example.normal(len(rays.directions), *rays.anchor.shape).to(dtype)
             latent = latent * 10 ** (4 * example.uniform(len(latent), 1, 1).to(dtype) - 2)
             action, log_det = flow.forward_and_log_det(latent)
             finite = action.isfinite().all(-1) & log_det.isfinite() | ~valid
@@ -88,7 +88,7 @@ def _valid(sets: ConstraintSet) -> Tensor:
     bad = [mask for _, mask, _ in sets.invalid_fields()]
     for value in sets.fields().values():
         size = value.abs()
-        # What scaling brought to infinity or made subnormal has lost its meaning.
+        # Scaling to infinity or to a subnormal number has changed the set, not its size.
         bad += [size.isfinite() & (size > most), (size > 0) & (size < tiny), value.isnan()]
     for mask in bad:
         valid = valid & ~mask.reshape(len(valid), -1).any(-1)

@@ -16,7 +16,7 @@ from cnfp_torchrl.testing.family_error import FamilyError, called, shown
 def check_event_dims(sets: ConstraintSet, anchor: Tensor) -> None:
     """`event_dims` maps each field to its number of event dimensions, and fits the example."""
     family = type(sets)
-    fields = [each.name for each in dataclasses.fields(sets)]
+    fields = [field.name for field in dataclasses.fields(sets)]
     dims = getattr(sets, "event_dims", None)
     if not isinstance(dims, Mapping) or not all(
         isinstance(name, str) and isinstance(number, int) and number >= 0
@@ -58,26 +58,26 @@ def check_event_dims(sets: ConstraintSet, anchor: Tensor) -> None:
 
 
 def check_invalid_fields(sets: ConstraintSet, anchor: Tensor) -> None:
-    """`violations` yields (field, boolean mask, words), and finds none in the example."""
+    """`invalid_fields` yields (field, boolean mask, expected), and accepts the example."""
     family = type(sets)
-    for rule in called(family, "violations", lambda: list(sets.invalid_fields())):
+    for rule in called(family, "invalid_fields", lambda: list(sets.invalid_fields())):
         if not (isinstance(rule, tuple) and len(rule) == 3 and rule[0] in sets.event_dims):
             raise FamilyError(
                 family,
-                "violations",
+                "invalid_fields",
                 f"expected (field, mask of bad elements, what was expected), given {rule!r}",
             )
         field, bad, _ = rule
         if not isinstance(bad, Tensor) or bad.dtype != torch.bool:
             given = getattr(bad, "dtype", type(bad).__name__)
             raise FamilyError(
-                family, "violations", f"expected a boolean mask for '{field}', given {given}"
+                family, "invalid_fields", f"expected a boolean mask for '{field}', given {given}"
             )
     try:
         sets.validate()
     except GeometryError as error:
         raise FamilyError(
-            family, "violations", f"expected to accept the example: {error}"
+            family, "invalid_fields", f"expected to accept the example: {error}"
         ) from error
 
 
@@ -87,8 +87,8 @@ def check_output_shapes(sets: ConstraintSet, anchor: Tensor) -> None:
     whole = anchor.expand(*batch, -1)
     ones = torch.ones_like(whole)
     for sample in ((), (3,), (5, 4)):
-        action, way = (each.expand(*sample, *whole.shape) for each in (whole, ones))
-        for method, call in _calls(sets, action, way, whole).items():
+        action, direction = (x.expand(*sample, *whole.shape) for x in (whole, ones))
+        for method, call in _calls(sets, action, direction, whole).items():
             dtype = torch.bool if method == "contains" else sets.dtype
             value = called(type(sets), method, call)
             _check_tensor(sets, method, value, (*sample, *batch), dtype)
@@ -107,15 +107,15 @@ def check_batches(sets: ConstraintSet, anchor: Tensor) -> None:
     batch = torch.broadcast_shapes(sets.batch_shape, anchor.shape[:-1])
     index = torch.arange(batch.numel(), device=anchor.device)
     flat, at = sets.select(batch, index), anchor.expand(*batch, -1).reshape(-1, anchor.shape[-1])
-    way = at + torch.linspace(-1, 2, at.shape[-1], dtype=at.dtype, device=at.device)
-    action = at + 0.1 * way
-    calls = _calls(flat, action, way, at)
+    direction = at + torch.linspace(-1, 2, at.shape[-1], dtype=at.dtype, device=at.device)
+    action = at + 0.1 * direction
+    calls = _calls(flat, action, direction, at)
     whole = {method: called(type(sets), method, call) for method, call in calls.items()}
     for i in index[:4]:
         one = flat.select(at.shape[:1], i)
-        for method, call in _calls(one, action[i], way[i], at[i]).items():
-            value, words = called(type(sets), method, call), f"element {int(i)} of a batch alone"
-            _check_same(one, method, value, whole[method][i], words)
+        for method, call in _calls(one, action[i], direction[i], at[i]).items():
+            value, case = called(type(sets), method, call), f"element {int(i)} of a batch alone"
+            _check_same(one, method, value, whole[method][i], case)
     one = flat.select(at.shape[:1], index[0])
     for name in one.fields():
         # One field gets a batch shape of its own.
@@ -124,20 +124,20 @@ def check_batches(sets: ConstraintSet, anchor: Tensor) -> None:
             for field, value in one.fields().items()
         }
         mixed = type(one)(**fields, validate_args=False)
-        words = f"batch shapes (2, 1) of '{name}' and (3,) of the other fields"
-        wide = [each[0].expand(*mixed.batch_shape, -1) for each in (action, way, at)]
+        case = f"batch shapes (2, 1) of '{name}' and (3,) of the other fields"
+        wide = [x[0].expand(*mixed.batch_shape, -1) for x in (action, direction, at)]
         for method, call in _calls(mixed, *wide).items():
-            _check_same(one, method, called(type(sets), method, call), whole[method][0], words)
+            _check_same(one, method, called(type(sets), method, call), whole[method][0], case)
 
 
 def _calls(
-    sets: ConstraintSet, action: Tensor, way: Tensor, anchor: Tensor
+    sets: ConstraintSet, action: Tensor, direction: Tensor, anchor: Tensor
 ) -> dict[str, Callable[[], Tensor]]:
     return {
         "slack": partial(sets.slack, action),
         "contains": partial(sets.contains, action),
-        "gauge": partial(sets.gauge, way, anchor),
-        "gauge_about": lambda: sets.gauge_about(anchor)(way),
+        "gauge": partial(sets.gauge, direction, anchor),
+        "gauge_about": lambda: sets.gauge_about(anchor)(direction),
     }
 
 
@@ -178,13 +178,13 @@ def _check_fields(
 
 
 def _check_same(
-    sets: ConstraintSet, method: str, value: Tensor, expected: Tensor, words: str
+    sets: ConstraintSet, method: str, value: Tensor, expected: Tensor, case: str
 ) -> None:
     if torch.allclose(value.double(), expected.double(), rtol=1e-3, equal_nan=True):
         return
     raise FamilyError(
         type(sets),
         method,
-        f"expected the same as in one batch, {shown(expected)}, given {shown(value)} for {words}: "
+        f"expected the same as in one batch, {shown(expected)}, given {shown(value)} for {case}: "
         f"fields {[f'{name} = {shown(field)}' for name, field in sets.fields().items()]}",
     )

@@ -1,4 +1,4 @@
-"""Checks of slack, containment, and what the search for anchors knows of a family."""
+"""Checks of slack and containment, and of what the search for anchors knows of a family."""
 
 from __future__ import annotations
 
@@ -25,21 +25,14 @@ _COUNT = 200
 
 
 def check_slack_at_the_anchor(example: Example) -> None:
-    """The given anchor has a positive slack and is contained."""
-    anchor = example.views[0].anchor
+    """The given anchor has a positive slack and is in the set."""
+    anchor = example.rays[0].anchor
     slack = example.sets.slack(anchor)
     expected = "a positive slack at the given anchor (or an anchor inside the set)"
     require(example.sets, "slack", slack > 0, expected, "a slack of", slack, anchor=anchor)
     inside = example.sets.contains(anchor)
-    require(
-        example.sets,
-        "contains",
-        inside,
-        "the given anchor inside",
-        "a slack of",
-        slack,
-        anchor=anchor,
-    )
+    expected = "the given anchor inside"
+    require(example.sets, "contains", inside, expected, "a slack of", slack, anchor=anchor)
 
 
 def check_contains_agrees_with_slack(example: Example) -> None:
@@ -54,30 +47,31 @@ def check_contains_agrees_with_slack(example: Example) -> None:
 
 
 def check_slack_bounds_the_distance(example: Example) -> None:
-    """No action nearer than the slack is outside."""
+    """Actions nearer to each other than the slack of one are both inside or both outside."""
     action = example.actions(_COUNT).requires_grad_()
     slack = example.sets.slack(action)
     (uphill,) = torch.autograd.grad(slack.nan_to_num().sum(), action)
     action, slack = action.detach(), slack.detach()
-    reach = slack.clamp(min=0).minimum(1e3 * example.size) * (1 - 1e-6)
-    for way in (-uphill.nan_to_num(), *example.ways(8)):
-        length = vector_norm(way, dim=-1, keepdim=True)
-        near = action + way / torch.where(length > 0, length, 1.0) * reach.unsqueeze(-1)
-        inside = example.sets.contains(near) | (slack <= 1e-9 * example.size)
+    reach = slack.abs().minimum(1e3 * example.size) * (1 - 1e-6)
+    uphill = uphill.nan_to_num()
+    for direction in (uphill, -uphill, *example.directions(8)):
+        length = vector_norm(direction, dim=-1, keepdim=True)
+        near = action + direction / torch.where(length > 0, length, 1.0) * reach.unsqueeze(-1)
+        same = example.sets.contains(near) == (slack > 0)
         require(
             example.sets,
             "slack",
-            inside,
-            "the distance to the boundary or less, as nothing nearer than the slack is outside",
+            same | (slack.abs() <= 1e-9 * example.size),
+            "the distance to the boundary or less, as nothing nearer than it is on the other side",
             "a slack of",
             slack,
             action=action,
-            outside=near,
+            other_side=near,
         )
 
 
 def check_slack_is_concave(example: Example) -> None:
-    """The slack is concave and has a gradient that says so, unless `superlevel` is stated."""
+    """The slack is concave, and its gradient says so, unless `superlevel` is stated instead."""
     sets = example.sets
     if sets.superlevel() is not None:
         return
@@ -94,7 +88,7 @@ def check_slack_is_concave(example: Example) -> None:
         one_action=one,
         other_action=other,
     )
-    at = torch.cat([one, example.views[0].anchor.unsqueeze(0)]).requires_grad_()
+    at = torch.cat([one, example.rays[0].anchor.unsqueeze(0)]).requires_grad_()
     value = sets.slack(at)
     (gradient,) = torch.autograd.grad(value.sum(), at)
     ahead = torch.cat([other, example.actions(1)]) - at.detach()
@@ -114,7 +108,7 @@ def check_slack_is_concave(example: Example) -> None:
 
 
 def check_superlevel(example: Example) -> None:
-    """What `superlevel` and `part_near` describe has the slack that they say, and enough of it."""
+    """Parts described by `superlevel` and `part_near` lie in the set and have its slack."""
     sets = example.sets
     part = called(type(sets), "superlevel", sets.superlevel)
     if part is None:
@@ -141,7 +135,7 @@ def check_superlevel(example: Example) -> None:
 
 
 def _check_part(example: Example, method: str, part: object, action: Tensor) -> Tensor:
-    """Return the slack that a part describes actions to have, no more than what they have."""
+    """Check that a part promises no more slack than the set has; return what it promises."""
     family, slack = type(example.sets), example.sets.slack(action)
     if not isinstance(part, Rows | Cone | KinkedSum):
         raise FamilyError(family, method, f"expected Rows, a Cone or a KinkedSum, given {part!r}")
@@ -154,12 +148,12 @@ def _check_part(example: Example, method: str, part: object, action: Tensor) -> 
 
 def check_search_keeps_the_set(example: Example) -> None:
     """The search for anchors keeps the set wherever the given anchor has slack enough."""
-    sets, bounds, anchor = example.sets, example.bounds, example.views[0].anchor
+    sets, bounds, anchor = example.sets, example.bounds, example.rays[0].anchor
     method = "slack" if sets.superlevel() is None else "superlevel"
     depths = row_depths([bounds, sets])
     rooms = [
-        (each.row_slacks(anchor) - 2 * depth).amin(-1)
-        for each, depth in zip((bounds, sets), depths, strict=True)
+        (constraint_set.row_slacks(anchor) - 2 * depth).amin(-1)
+        for constraint_set, depth in zip((bounds, sets), depths, strict=True)
     ]
     slack = torch.minimum(*rooms)
     found = called(type(sets), method, lambda: lexicographic_anchor([bounds, sets]))
@@ -172,8 +166,8 @@ def check_bounding_box(example: Example) -> None:
     """The bounding box holds what the set contains."""
     box = Box(*example.sets.bounding_box(), validate_args=False)
     points = [example.actions(5 * _COUNT)]
-    for view in example.views:
-        points.append(view.at(example.sets.gauge(view.ways, view.anchor).clamp(min=1)))
+    for rays in example.rays:
+        points.append(rays.ends(example.sets.gauge(rays.directions, rays.anchor).clamp(min=1)))
     action = torch.cat(points)
     outside = example.sets.slack(action) < 0
     slack = box.slack(action)
@@ -185,20 +179,20 @@ def check_bounding_box(example: Example) -> None:
 def check_contains_is_exact(example: Example) -> None:
     """`contains` judges float32 actions at the boundary by float64 arithmetic."""
     sets = example.cast(torch.float32)[1]
-    for view in example.views:
-        gauge = example.sets.gauge(view.ways, view.anchor).clamp(min=0.25)
-        ulps = 4 * (example.uniform(*view.ways.shape) - 0.5) * torch.finfo(torch.float32).eps
-        action = (view.at(gauge) * (1 + ulps)).float()
+    for rays in example.rays:
+        gauge = example.sets.gauge(rays.directions, rays.anchor).clamp(min=0.25)
+        ulps = 4 * (example.uniform(*rays.directions.shape) - 0.5) * torch.finfo(torch.float32).eps
+        action = (rays.ends(gauge) * (1 + ulps)).float()
         slack = example.sets.slack(action.double())
         same = sets.contains(action) == example.sets.contains(action.double())
-        # What float64 itself cannot tell.
+        # Nearer to the boundary float64 itself cannot tell.
         same = same | (slack.abs() <= 1e-13 * example.size)
         expected = "the float32 numbers judged in float64, also at the boundary"
         require(sets, "contains", same, expected, "another answer at slack", slack, action=action)
 
 
 def _chords(example: Example) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return whether the slack is above chords, its value, the chord's, and the chord's ends."""
+    """Return whether the slack lies above chords, the slack, the chords, and their two ends."""
     one, other = example.actions(_COUNT), example.actions(_COUNT).flip(0)
     share = example.uniform(_COUNT, one.shape[1])
     at_one, at_other = example.sets.slack(one), example.sets.slack(other)
@@ -208,12 +202,12 @@ def _chords(example: Example) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _tolerance(example: Example, slack: Tensor) -> Tensor:
-    """Return what rounding, of example and arithmetic, may make of a slack."""
+    """Return the largest rounding error of a slack, of the example's numbers and arithmetic."""
     return 1e-7 * (example.size + slack.abs().nan_to_num(posinf=0.0))
 
 
 def _level(part: Superlevel, action: Tensor) -> Tensor:
-    """Return the largest slack t for which an action is described."""
+    """Return the largest t for which a description of {slack >= t} holds an action."""
     match part:
         case Rows(normals, offsets, rates):
             room = offsets - (normals * action.unsqueeze(-2)).sum(-1)
