@@ -181,10 +181,12 @@ class ConstrainedFlow(TransformedDistribution):
                 the density to be exact.
 
         Raises:
-            ValueError: for a depth outside of (0, 1), and for actions that are not finite.
+            ValueError: for a depth outside of (0, 1), and for actions of another shape or dtype or
+                not finite.
         """
         if not 0 < depth < 1:
             raise ValueError(f"depth: expected a share between 0 and 1, given {depth}")
+        self._refuse_other_shapes(value)
         if not bool(value.isfinite().all()):
             index = (~value.isfinite()).nonzero()[0].tolist()
             raise ValueError(

@@ -25,9 +25,7 @@ def told_in_a_sentence() -> Iterator[None]:
         yield
     except MissingMandatoryValue as error:
         key = error.full_key
-        raise CompactHydraException(
-            f"{key}: expected a value, given none; add {key}=..."
-        ) from error
+        raise CompactHydraException(f"{key}: expected a value, given none; add {key}=...") from None
     except (ValueError, TypeError, OSError) as error:
         if not _raised_by_this_package(error):
             raise

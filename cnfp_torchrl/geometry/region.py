@@ -215,7 +215,7 @@ class Region:
         """
         from cnfp_torchrl.geometry.anchor import LEEWAY, lexicographic_anchor
 
-        if sets and isinstance(sets[0], Box):
+        if len(sets) and isinstance(sets[0], Box):
             require_action_bounds(sets[0])
         found = lexicographic_anchor(sets, candidate, LEEWAY if leeway is None else leeway)
         return cls(tuple(sets), found.anchor, found.active, found.relaxation)

@@ -133,8 +133,13 @@ def in_order(
             )
     refuse_string("order", order)
     names = [bijector.name for bijector in bijectors]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(
+            f"names: expected a name of its own for each constraint, given "
+            f"{repeated} more than once"
+        )
     wanted = list(names if order is None else order)
-    if sorted(wanted) != sorted(set(names)) or len(names) != len(set(names)):
+    if sorted(wanted) != sorted(names):
         raise ValueError(
             f"order: expected each of the constraints {names} exactly once, given {wanted}"
         )

@@ -386,6 +386,19 @@ def test_what_lies_beside_a_shadow_is_visible(
     assert found.active.tolist() == [True, False, True]
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        pytest.param(Ball(torch.zeros(3), torch.tensor(1.0)), "Ball of 3 components", id="dim"),
+        pytest.param(torch.zeros(2), "Tensor", id="type"),
+    ],
+)
+def test_a_set_that_does_not_fit_the_bounds_is_named(given: ConstraintSet, told: str) -> None:
+    for build in (lexicographic_anchor, Region.build):
+        with pytest.raises(GeometryError, match=rf"sets\[2\]: .* 2 components.* given {told}"):
+            build([BOUNDS, DISC, given])
+
+
 def test_bounds_are_asked_for() -> None:
     with pytest.raises(GeometryError, match=r"sets\[0\]: expected the Box of action bounds"):
         lexicographic_anchor([DISC])

@@ -267,7 +267,7 @@ def test_constraining_twice_keeps_both(
     assert torch.equal(act(twice, state)["action"], act(both, state)["action"])
     turned = constrain(once, bijectors=[obstacle], order=["obstacle", "battery"])
     assert flow_head(turned).order == ["obstacle", "battery"]
-    with pytest.raises(ValueError, match="exactly once"):
+    with pytest.raises(ValueError, match=r"battery.* more than once"):
         constrain(once, bijectors=[battery])
 
 

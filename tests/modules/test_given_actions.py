@@ -115,6 +115,16 @@ def test_a_bad_depth_is_refused(make_actor: MakeActor, state: TensorDictBase, de
         distribution(make_actor(), state).nearest_log_prob(torch.zeros(8, 2), depth)
 
 
+@pytest.mark.parametrize(
+    "given", [torch.zeros(8, 3), torch.zeros(7, 2), torch.zeros(8, 2).long()], ids=["d", "n", "int"]
+)
+def test_actions_of_another_shape_or_dtype_are_refused(
+    make_actor: MakeActor, state: TensorDictBase, given: torch.Tensor
+) -> None:
+    with pytest.raises(ValueError, match="value: expected floating actions"):
+        distribution(make_actor(), state).nearest_log_prob(given)
+
+
 def test_what_is_not_finite_is_refused(make_actor: MakeActor, state: TensorDictBase) -> None:
     given = torch.zeros(8, 2)
     given[3, 1] = torch.nan

@@ -28,12 +28,20 @@ def bounds_of(sets: Sequence[ConstraintSet]) -> Box:
     """Return the action bounds, which come first.
 
     Raises:
-        GeometryError: when the first set is no box.
+        GeometryError: when the first set is no box, or another no set of as many components.
     """
-    if not sets or not isinstance(sets[0], Box):
+    bounds = next(iter(sets), None)
+    if not isinstance(bounds, Box):
         given = [type(each).__name__ for each in sets]
         raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-    return sets[0]
+    for stage, each in enumerate(sets):
+        if not isinstance(each, ConstraintSet) or each.dim != bounds.dim:
+            of = f" of {each.dim} components" if isinstance(each, ConstraintSet) else ""
+            raise GeometryError(
+                f"sets[{stage}]: expected a ConstraintSet of actions with {bounds.dim} components, "
+                f"as the action bounds have, given {type(each).__name__}{of}"
+            )
+    return bounds
 
 
 def smallest_width(bounds: Box) -> Tensor:
