@@ -59,8 +59,7 @@ class Samples:
     @property
     def active(self) -> Tensor:
         """Which constraints are active in which state, ``(n, K)``."""
-        assert self.region.active is not None
-        return self.region.active[..., 1:]
+        return self.region.is_active[..., 1:]
 
     @property
     def amounts(self) -> Tensor:
@@ -136,8 +135,7 @@ def describe_state(
 ) -> dict[str, Any]:
     """Return a state ``()`` as plain values: its entries, and each constraint's set."""
     region = head.get_region(state)
-    assert region.active is not None
-    flags, amounts = region.active[1:].tolist(), region.amounts()[1:]
+    flags, amounts = region.is_active[1:].tolist(), region.amounts()[1:]
     given = zip(head.order, region.sets[1:], flags, amounts, strict=True)
     return {
         "state": {_name(key): plain(state.get(key)) for key in keys},

@@ -164,11 +164,11 @@ def _draw_scene(
     low, high = scene.region.bounds.low.tolist(), scene.region.bounds.high.tolist()
     pad = [0.06 * (b - a) for a, b in zip(low, high, strict=True)]
     view = (low[0] - pad[0], high[0] + pad[0], low[1] - pad[1], high[1] + pad[1])
+    active = scene.region.is_active.tolist()
     for k, name in enumerate(order, start=1):
-        active = scene.region.active is None or bool(scene.region.active[k])
         for line in set_outline(scene.region.sets[k], view):
             width = 2.4 if name == scene.name else 1.3
-            dashes = "-" if active else (0, (1.2, 1.8))
+            dashes = "-" if active[k] else (0, (1.2, 1.8))
             axes.plot(*line.T, color=colors[name], linewidth=width, linestyle=dashes, zorder=5)
     edge = region_outline(scene.region, range(len(scene.region.sets)))
     axes.plot(*edge.T, color=INK, linewidth=1.0, zorder=6)
