@@ -56,6 +56,10 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 # An override without a docstring says nothing that its base class does not say.
 autodoc_inherit_docstrings = False
+# Pages are written by docs/extensions/api.py.
+autosummary_generate = False
+# `view=NOTHING`, not what the object looks like.
+autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True

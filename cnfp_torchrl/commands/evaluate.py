@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ with needs_extra("train"):
     from cnfp_torchrl.configuration import config_directory, require_settings
     from cnfp_torchrl.text_table import text_table
     from cnfp_torchrl.training.callbacks import RECORDING, CallbackFactory, show_episodes
+    from cnfp_torchrl.training.constraint_counts import count_text, gave_way_text
     from cnfp_torchrl.training.evaluation import evaluate_run
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.settings import EvaluationSettings
@@ -26,16 +27,24 @@ with needs_extra("train"):
 
 
 def evaluation_table(reports: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the reports of `evaluate_run` as a text table."""
+    """Return the reports of `evaluate_run` as text: a table, and what gave way."""
     names = list(next(iter(reports.values()))["violations"])
     rows = [["policy", "return", "score", *(f"{name} violations" for name in names)]]
     for policy, report in reports.items():
         error = report["return_standard_error"]
         spread = "" if error is None else f" +- {error:.2f}"
         score = "-" if report["score"] is None else f"{report['score']:.3f}"
-        counts = [str(report["violations"][name]) for name in names]
+        counts = [count_text(report["violations"][name]) for name in names]
         rows.append([policy, f"{report['return_mean']:.2f}{spread}", score, *counts])
-    return text_table(rows)
+    return "\n".join([text_table(rows), *_gave_way(reports)])
+
+
+def _gave_way(reports: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a line for each constraint that gave way under a policy."""
+    for policy, report in reports.items():
+        for name, counts in report["constraints"].items():
+            if said := gave_way_text(counts):
+                yield f"{policy}: {name} {said}"
 
 
 @hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from typing import Any
 
 from cnfp_torchrl.commands.extras import needs_extra
 
@@ -13,6 +15,7 @@ with needs_extra("train"):
     from omegaconf import DictConfig, OmegaConf
 
     from cnfp_torchrl.configuration import config_directory
+    from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
@@ -33,6 +36,20 @@ def _save_hydra_files(folder: RunFolder, config: DictConfig) -> None:
             file.write(OmegaConf.to_yaml(content).encode())
 
 
+def _told(summary: Mapping[str, Any]) -> str:
+    """Return the results in a line, and one for each constraint that gave way or was broken."""
+    counts = ", ".join(f"{name} {count_text(n)}" for name, n in summary["violations"].items())
+    score = "" if summary["score"] is None else f", score {summary['score']:.3f}"
+    lines = [
+        f"return {summary['return_mean']:.2f}{score}; violations: {counts or NOT_COUNTED}; "
+        f"{summary['steps']} steps in {summary['seconds']:.0f} s"
+    ]
+    for name, report in summary["constraints"].items():
+        if said := gave_way_text(report):
+            lines.append(f"{name} {said}")
+    return "\n".join(lines)
+
+
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
 def main(config: DictConfig) -> float | None:
     """Train, draw the run's figures, print the summary, and return the score for sweeps."""
@@ -41,12 +58,7 @@ def main(config: DictConfig) -> float | None:
     summary = train(config, folder)
     if config.figures:
         instantiate(config.figures)(folder)
-    violations = ", ".join(f"{name} {count}" for name, count in summary["violations"].items())
-    score = "" if summary["score"] is None else f", score {summary['score']:.3f}"
-    sys.stdout.write(
-        f"return {summary['return_mean']:.2f}{score}; violations: {violations or 'not counted'}; "
-        f"{summary['steps']} steps in {summary['seconds']:.0f} s\n{folder.path}\n"
-    )
+    sys.stdout.write(f"{_told(summary)}\n{folder.path}\n")
     return summary["score"]
 
 

@@ -10,17 +10,18 @@ from torchrl.data import Composite
 from torchrl.envs import Transform
 
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
-from cnfp_torchrl.keys import ANCHOR_KEY, require
+from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     appended_transforms,
     constraint_bijectors,
+    refuse_relaxed,
     refuse_violations,
 )
 
 
 class ActionGuard(Transform):
-    """Raise before an action outside an active constraint's set or the action bounds is executed.
+    """Raise before an action outside a constraint's set or the action bounds is executed.
 
     Whoever chose it: an actor, ``env.rand_action``, a collector's ``init_random_frames``. The check
     is that of `cnfp_torchrl.modules.ExecutedActionGuard`, with zero tolerance, and never repairs.
@@ -35,26 +36,35 @@ class ActionGuard(Transform):
     constrained, whose geometry must then hold for all of these steps.
     `torchrl.envs.check_env_specs` acts at random: call it before.
 
+    Args:
+        refuse_relaxation: Whether to raise, too, in states in which a constraint is not active,
+            whatever the action. A set without interior, such as an equality, is never active.
+
     Raises:
         ValueError: when the environment publishes no constraint or no anchor, or changes actions
             between its constraints and the guard.
         ConstraintViolationError: at a step, naming constraint, batch index, action and slack.
+        RelaxedConstraintError: at a step, with `refuse_relaxation`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, refuse_relaxation: bool = False) -> None:
         super().__init__()
+        self.refuse_relaxation = refuse_relaxation
         # Made once the environment is known; a module, to move with the environment.
         self._head: ConstrainedFlowModule | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         head = self._flow_head()
         action = require(tensordict, head.action_key, "call a policy before the step").detach()
+        region = head.get_region(tensordict)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             # What is not executed needs no check; the anchor passes it.
-            mask = stepped.reshape(*tensordict.batch_size, 1)
-            action = torch.where(mask, action, tensordict.get(ANCHOR_KEY).to(action.dtype))
-        refuse_violations(head.order, head.get_region(tensordict), action)
+            stepped = stepped.reshape(tensordict.batch_size)
+            action = torch.where(stepped.unsqueeze(-1), action, region.anchor.to(action.dtype))
+        if self.refuse_relaxation:
+            refuse_relaxed(head.order, region, stepped)
+        refuse_violations(head.order, region, action)
         return tensordict
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

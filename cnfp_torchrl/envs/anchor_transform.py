@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
+from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
 from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, lexicographic_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
@@ -43,6 +44,9 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
     - ``("constraints", NAME, "row_relaxation")``, ``(*batch, m)``: the same row by row, if its
       family has rows.
 
+    A constraint that gives way in each state of the first larger batches (of 256 states, or as many
+    of smaller ones) is warned of, once (`RelaxedEverywhereWarning`).
+
     Args:
         bijectors: One for each constraint; they know where the geometry lies.
         order: The constraints' names in order of application, the last with the highest priority;
@@ -66,8 +70,14 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         super().__init__()
         self._leeway = leeway
         self._bijectors = in_order(bijectors, order)
+        self._watch = RelaxationWatch([each.name for each in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
+
+    @property
+    def leeway(self) -> float:
+        """By how much relaxed constraints give way beyond the least amount."""
+        return self._leeway
 
     @property
     def bijectors(self) -> list[ConstraintBijector]:
@@ -89,6 +99,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             candidate = candidate.to(bounds.dtype)
         found = lexicographic_anchor([bounds, *sets], candidate, self._leeway)
         batch, largest = next_tensordict.batch_size, found.largest()
+        self._watch([bounds, *sets], largest, batch.numel())
         next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
         for stage, bijector in enumerate(self._bijectors, start=1):
             next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))

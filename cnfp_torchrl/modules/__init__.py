@@ -25,7 +25,9 @@ from cnfp_torchrl.modules.flows import (
 from cnfp_torchrl.modules.guard import (
     ConstraintViolationError,
     ExecutedActionGuard,
+    RelaxedConstraintError,
     guarded,
+    refuse_relaxed,
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
@@ -52,6 +54,7 @@ __all__ = [
     "MissingGeometryError",
     "ProjectionFlow",
     "RadialFlow",
+    "RelaxedConstraintError",
     "SafeRandomPolicy",
     "SquashFlow",
     "UnconstrainedFlow",
@@ -68,6 +71,7 @@ __all__ = [
     "make_constrained_actor",
     "refuse_exploration",
     "refuse_other_bounds",
+    "refuse_relaxed",
     "refuse_violations",
     "split_at_latent",
     "with_reference_entropy",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -25,7 +25,12 @@ from cnfp_torchrl.modules import (
     guarded,
 )
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.environment import counted_constraints
+from cnfp_torchrl.training.constraint_counts import (
+    ConstraintCounts,
+    ConstraintTally,
+    constraint_reports,
+    violations_of,
+)
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 
@@ -87,21 +92,21 @@ class Evaluation:
 
     Args:
         returns: undiscounted return of each episode, ``(episodes,)``.
-        costs: violations of each episode by constraint, ``(episodes, K)``.
-        names: the constraints' names.
-        steps: number of steps taken in all.
+        costs: violations of each episode by judge, ``(episodes, J)``.
+        constraints: counts of each constraint: those that are judged first, in the order of the
+            costs.
+        steps: number of steps of these episodes in all.
     """
 
     returns: Tensor
     costs: Tensor
-    names: tuple[str, ...]
+    constraints: Mapping[str, ConstraintCounts]
     steps: int
 
     @property
-    def violations(self) -> dict[str, int]:
-        """Violating steps by constraint."""
-        totals = self.costs.sum(0).round().long().tolist()
-        return dict(zip(self.names, totals, strict=True))
+    def violations(self) -> dict[str, int | None]:
+        """Violating steps by constraint, None for those that nothing judges."""
+        return violations_of(self.constraints)
 
     def report(self, score: LinearScore | None) -> dict[str, Any]:
         """Return the numbers as plain values."""
@@ -113,6 +118,7 @@ class Evaluation:
             "return_standard_error": spread,
             "score": None if score is None else score(mean),
             "violations": self.violations,
+            "constraints": constraint_reports(self.constraints),
             "episodes": episodes,
             "steps": self.steps,
         }
@@ -170,21 +176,22 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes: expected a number >= 1, given {episodes}")
-    names = counted_constraints(env)
+    tally = ConstraintTally.of(env)
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    batches: list[Evaluation] = []
+    returns = torch.zeros(0)
+    costs, steps = torch.zeros(0, len(tally.judged)), 0
     with set_exploration_type(mode):
-        while sum(len(batch.returns) for batch in batches) < episodes:
-            batches.append(_run_batch(env, policy, names, max_steps, on_step))
-    returns = torch.cat([batch.returns for batch in batches])[:episodes]
+        while (missing := episodes - len(returns)) > 0:
+            batch = _run_batch(env, policy, tally, missing, max_steps, on_step)
+            returns = torch.cat([returns, batch[0]])
+            costs, steps = torch.cat([costs, batch[1]]), steps + batch[2]
     if not bool(returns.isfinite().all()):
         broken = int((~returns.isfinite()).sum())
         raise FloatingPointError(
             f"return: expected finite numbers, but those of {broken} of {episodes} episodes are "
             "not; look at the environment's reward and at the policy's parameters"
         )
-    costs = torch.cat([batch.costs for batch in batches])[:episodes]
-    return Evaluation(returns, costs, names, sum(batch.steps for batch in batches))
+    return Evaluation(returns, costs, tally.counts(), steps)
 
 
 def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
@@ -198,27 +205,30 @@ def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
 def _run_batch(
     env: EnvBase,
     policy: Policy,
-    names: tuple[str, ...],
+    tally: ConstraintTally,
+    most: int,
     max_steps: int,
     on_step: Callable[[TensorDictBase], None] | None,
-) -> Evaluation:
-    """Run one episode of every agent."""
+) -> tuple[Tensor, Tensor, int]:
+    """Run one episode of every agent; return those of the first ones, with costs and steps."""
     size = env.batch_size.numel()
     running = torch.ones(size, dtype=torch.bool, device=env.device)
+    wanted = torch.arange(size, device=env.device) < most
     returns = torch.zeros(size, device=env.device)
-    costs = torch.zeros(size, len(names), device=env.device)
+    costs = torch.zeros(size, len(tally.judged), device=env.device)
     steps = 0
     for transition in islice(transitions(env, policy), max_steps):
         if on_step is not None:
             on_step(transition)
         outcome = transition.get("next")
+        tally.add(transition, running & wanted)
         returns += running * outcome.get("reward").reshape(size)
-        if names:
-            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(size, len(names))
-        steps += int(running.sum())
+        if tally.judged:
+            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(costs.shape)
+        steps += int((running & wanted).sum())
         running = running & ~outcome.get("done").reshape(size)
         if not bool(running.any()):
-            return Evaluation(returns.cpu(), costs.cpu(), names, steps)
+            return returns[:most].cpu(), costs[:most].cpu(), steps
     raise RuntimeError(
         f"max_steps: expected every episode to end within {max_steps} steps, but "
         f"{int(running.sum())} of {size} go on; truncate the environment"

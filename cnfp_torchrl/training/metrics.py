@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 from tensordict import TensorDictBase
@@ -14,13 +14,20 @@ from torch import Tensor
 from torchrl.record.loggers import Logger, TensorboardLogger
 from tqdm import tqdm
 
+from cnfp_torchrl.training.constraint_counts import (
+    NOT_COUNTED,
+    ConstraintCounts,
+    ConstraintTally,
+    violations_of,
+)
+
 
 class Metrics:
-    """Counts of returns and violations, the log of scalars, and the progress bar.
+    """Counts of returns, violations and relaxations, the log of scalars, and the progress bar.
 
     Args:
         loggers: TorchRL loggers; each scalar goes to all of them.
-        constraint_names: names of the columns of ``cost``, none if the environment counts nothing.
+        tally: tally of the environment's constraints, which has counted nothing yet.
         total_frames: the length of the run, in environment steps.
         interval: environment steps between two entries of the log.
     """
@@ -28,7 +35,7 @@ class Metrics:
     def __init__(
         self,
         loggers: Iterable[Logger],
-        constraint_names: Sequence[str],
+        tally: ConstraintTally,
         *,
         total_frames: int,
         interval: int,
@@ -36,7 +43,7 @@ class Metrics:
         self.frames = 0
         self._started = time.perf_counter(), time.process_time()
         self._logged_at = 0
-        self.violations = dict.fromkeys(constraint_names, 0)
+        self._recent, self._before = tally, tally.counts()
         self._loggers = list(loggers)
         self._interval = interval
         self._next_log = interval
@@ -47,13 +54,15 @@ class Metrics:
         pause = 0.1 if sys.stderr.isatty() else 10.0
         self._bar = tqdm(total=total_frames, unit="step", dynamic_ncols=True, mininterval=pause)
 
+    def counts(self) -> dict[str, ConstraintCounts]:
+        """Return what happened to each constraint so far."""
+        recent = self._recent.counts()
+        return {name: before + recent[name] for name, before in self._before.items()}
+
     def add_steps(self, batch: TensorDictBase) -> None:
         """Count a batch ``(steps,)`` of transitions."""
+        self._recent.add(batch)
         outcome = batch.get("next")
-        if self.violations:
-            costs = outcome.get("cost").sum(0).tolist()
-            for name, cost in zip(self.violations, costs, strict=True):
-                self.violations[name] += round(cost)
         done = outcome.get("done").squeeze(-1)
         if bool(done.any()):
             self._returns.append(outcome.get("episode_reward")[done].flatten())
@@ -97,8 +106,7 @@ class Metrics:
             self._last_return = self._finite("return", torch.cat(self._returns))
             self._log("train/return", self._last_return)
             self._returns.clear()
-        for name, count in self.violations.items():
-            self._log(f"violations/{name}", count)
+        total = self._log_constraints()
         for name, values in self._losses.items():
             mean = self._finite(name, torch.stack(values))
             is_loss = name.startswith("loss_")
@@ -107,8 +115,21 @@ class Metrics:
         speed = self._bar.format_dict["rate"]
         if speed:
             self._log("train/steps_per_second", speed)
-        total = sum(self.violations.values())
         self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
+
+    def _log_constraints(self) -> str:
+        """Log the constraints' counts, and return all violations so far as text."""
+        for name, recent in self._recent.counts().items():
+            if recent.steps:
+                self._log(f"relaxed/{name}", recent.share("relaxed"))
+                self._log(f"dropped/{name}", recent.share("dropped"))
+                self._log(f"relaxation/{name}", recent.largest_relaxation)
+                self._log(f"mean_relaxation/{name}", recent.mean_relaxation)
+        self._before, self._recent = self.counts(), self._recent.fresh()
+        counted = {k: n for k, n in violations_of(self._before).items() if n is not None}
+        for name, count in counted.items():
+            self._log(f"violations/{name}", count)
+        return str(sum(counted.values())) if counted else NOT_COUNTED
 
     def _finite(self, name: str, values: Tensor) -> float:
         mean = float(values.mean())

@@ -28,7 +28,11 @@ from cnfp_torchrl.training.callbacks import (
     TrainingCallback,
     first_episodes,
 )
-from cnfp_torchrl.training.environment import counted_constraints
+from cnfp_torchrl.training.constraint_counts import (
+    ConstraintTally,
+    constraint_reports,
+    violations_of,
+)
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -102,7 +106,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     ]
     metrics = Metrics(
         [*loggers, *callback.loggers],
-        counted_constraints(env),
+        ConstraintTally.of(env),
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
@@ -174,16 +178,16 @@ def _evaluations(
 def _results(
     metrics: Metrics, evaluations: Mapping[str, Evaluation], score: LinearScore | None
 ) -> dict[str, Any]:
-    """Return what the summary says of training and evaluations; violations are of them all."""
+    """Return what the summary says of training and evaluations; counts are of them all."""
     reports = {name: result.report(score) for name, result in evaluations.items()}
-    violations = {
-        name: count + sum(result.violations[name] for result in evaluations.values())
-        for name, count in metrics.violations.items()
-    }
+    counts = dict(training := metrics.counts())
+    for result in evaluations.values():
+        counts = {name: each + result.constraints[name] for name, each in counts.items()}
     return {
         "return_mean": reports["stochastic"]["return_mean"],
         "score": reports["stochastic"]["score"],
-        "violations": violations,
-        "training_violations": metrics.violations,
+        "violations": violations_of(counts),
+        "training_violations": violations_of(training),
+        "constraints": constraint_reports(counts),
         "evaluation": reports,
     }

@@ -14,7 +14,7 @@ from torch.linalg import vector_norm
 from cnfp_torchrl.envs import NOTHING, TaskView
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
-Effect = Literal["permissive", "restrictive", "dropped", "broken"]
+Effect = Literal["permissive", "restrictive", "relaxed", "dropped", "broken"]
 
 Vector = tuple[float, ...]
 
@@ -30,14 +30,16 @@ class ConstraintEffect:
 
     Args:
         name: of the constraint.
-        effect: ``permissive``, it changed no sample; ``restrictive``, it changed some; ``dropped``,
-            it cannot hold here; ``broken``, the executed action lies outside its set.
+        effect: ``permissive``, it changed no sample; ``restrictive``, it changed some; ``relaxed``,
+            it cannot hold as stated and its set is widened; ``dropped``, it cannot hold here;
+            ``broken``, the executed action lies outside its set.
         before: the executed action before its stage, None where it has none or the way is unknown.
         after: the executed action after its stage, or None.
         moved: by how much its stage moved the executed action, in action units, or None.
         share_moved: of the samples, how many its stage moved; None where it moves all of them.
         share_outside: of the samples, how many lie outside its set in the end.
         share_allowed: of the action bounds, how much its set allows; None in many dimensions.
+        relaxation: by how much its set is widened; 0 where it holds, infinite where it is dropped.
         slack: of the executed action in its set: inside by so much, outside where negative.
         sentence: what the task says about it in this state, or None.
     """
@@ -50,6 +52,7 @@ class ConstraintEffect:
     share_moved: float | None
     share_outside: float
     share_allowed: float | None
+    relaxation: float
     slack: float
     sentence: str | None
 
@@ -103,8 +106,17 @@ class Explanation:
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def _headline(self) -> str:
-        moved = [each for each in self.constraints if each.effect == "restrictive" and each.moved]
+        moved = [
+            each
+            for each in self.constraints
+            if each.effect in ("restrictive", "relaxed") and each.moved
+        ]
         said = [f"{each.name} moved the executed action by {each.moved:.3f}" for each in moved]
+        said += [
+            f"{each.name} is relaxed by {each.relaxation:.3g}"
+            for each in self.constraints
+            if each.effect == "relaxed"
+        ]
         said += [
             f"{each.name} is {each.effect}"
             for each in self.constraints
@@ -137,12 +149,15 @@ class Explanation:
         ]
 
     def _verdict(self, each: ConstraintEffect) -> str:
-        if each.effect == "dropped":
+        if each.effect in ("dropped", "relaxed"):
             names = [other.name for other in self.constraints if other.effect != "dropped"]
             order = [other.name for other in self.constraints]
             higher = [name for name in names if order.index(name) > order.index(each.name)]
             others = f" together with {_listed(higher)}" if higher else ""
-            return f"dropped, no action within the bounds keeps it{others}."
+            reason = f"no action within the bounds keeps it{others}"
+            if each.effect == "dropped":
+                return f"dropped, {reason}."
+            return f"relaxed, {reason}: its set is widened by {each.relaxation:.3g}."
         if each.effect == "broken":
             where = f"the executed action lies outside its set by {-each.slack:.3g}"
             return f"broken, {where}, with {_percent(each.share_outside)} of the samples."
@@ -226,6 +241,8 @@ def _effect(
         effect = "dropped"
     elif not bool(contained[snapshot.followed]):
         effect = "broken"
+    elif snapshot.is_safe and snapshot.relaxation[index] > 0:
+        effect = "relaxed"
     elif (share_moved == 0 and not moved) if snapshot.is_safe else share_allowed == 1:
         effect = "permissive"
     return ConstraintEffect(
@@ -237,6 +254,7 @@ def _effect(
         share_moved=share_moved,
         share_outside=_share(~contained),
         share_allowed=share_allowed,
+        relaxation=snapshot.relaxation[index],
         slack=float(allowed.to(torch.float64).slack(action.double())),
         sentence=sentence,
     )

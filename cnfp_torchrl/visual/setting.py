@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -112,7 +112,7 @@ class Setting:
         return len(self.low)
 
     @cached_property
-    def colors(self) -> Mapping[str, str]:
+    def colors(self) -> dict[str, str]:
         """The constraints' colors, those of all figures."""
         return constraint_colors(self.constraints)
 

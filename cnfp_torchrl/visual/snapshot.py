@@ -29,14 +29,20 @@ class Stage:
         samples: ``(n, d)``.
         log_density: of those samples in the distribution after this stage, ``(n,)``.
         applied: indices into the region's sets of those applied so far, this one last.
-        active: whether the constraint holds in this state; a dropped one changes nothing.
+        relaxation: by how much the constraint's set had to be widened to hold in this state;
+            infinite for one that is dropped and changes nothing.
     """
 
     name: str
     samples: Tensor
     log_density: Tensor
     applied: tuple[int, ...]
-    active: bool
+    relaxation: float
+
+    @property
+    def active(self) -> bool:
+        """Whether the constraint holds in this state as it is stated."""
+        return self.relaxation == 0
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,9 @@ class FlowSnapshot:
         latents: base samples, ``(n, d)``.
         latent_log_density: ``(n,)``.
         stages: in order of application.
-        region: sets (``sets[0]`` the action bounds), anchor and active flags of this state.
+        region: sets as they are applied in this state, widened where they are relaxed
+            (``sets[0]`` the action bounds), anchor, and which sets are not dropped.
+        relaxation: by how much each of its sets is widened; infinite where it is dropped.
         through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
         log_densities: of further actions ``(n, d)`` after each stage, ``(stages, n)``; -inf where
@@ -70,6 +78,7 @@ class FlowSnapshot:
     latent_log_density: Tensor
     stages: tuple[Stage, ...]
     region: Region
+    relaxation: tuple[float, ...]
     through_stages: Callable[[Tensor], tuple[Tensor, Tensor]]
     log_densities: Callable[[Tensor], Tensor]
     head: ConstrainedFlowModule
@@ -97,7 +106,7 @@ class FlowSnapshot:
         return tuple(n for k, n in enumerate(self.constraint_names, 1) if not self.is_active(k))
 
     def is_active(self, index: int) -> bool:
-        """Tell whether ``region.sets[index]`` holds in this state."""
+        """Tell whether ``region.sets[index]`` is applied in this state, as stated or relaxed."""
         return bool(self.region.is_active[index])
 
     @cached_property
@@ -175,7 +184,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     """
     loc, scale = (state.get(key) for key in head.parameter_keys)
     base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-    region = _region(head, state)
+    region, relaxation = _as_applied(head, state)
     applied = _applied(head.stage_names, head.order)
     staged = StagedFlow(head.flow, region, [sets for _, sets in applied])
 
@@ -201,7 +210,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
             actions[i],
             latent_log_density - log_dets[i],
             sets,
-            bool(on_host.is_active[sets[-1]]),
+            relaxation[sets[-1]],
         )
         for i, (name, sets) in enumerate(applied)
     )
@@ -213,17 +222,32 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
         latent_log_density=latent_log_density,
         stages=stages,
         region=on_host,
+        relaxation=relaxation,
         through_stages=through_stages,
         log_densities=log_densities,
         head=head,
     )
 
 
-def _region(head: ConstrainedFlowModule, state: TensorDictBase) -> Region:
-    """Return the region of a state, whose anchor only exact flows make the environment find."""
+def _as_applied(
+    head: ConstrainedFlowModule, state: TensorDictBase
+) -> tuple[Region, tuple[float, ...]]:
+    """Return the region of a state with sets as the flow applies them, and their relaxations.
+
+    The anchor, which only exact flows make the environment find, is looked for where it is missing.
+    """
     if state.get(ANCHOR_KEY, None) is not None:
-        return head.get_region(state)
-    return Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
+        region = head.get_region(state)
+    else:
+        region = Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
+    active = [True] * len(region.sets) if region.active is None else region.active.tolist()
+    sets, relaxation = list(region.sets), [0.0 if flag else torch.inf for flag in active]
+    if head.flow.is_safe and region.relaxation is not None:
+        for k, amounts in enumerate(region.relaxation):
+            if not active[k] and sets[k].can_be_inflated() and bool(amounts.isfinite().all()):
+                sets[k], relaxation[k] = sets[k].inflated(amounts), float(amounts.amax())
+    holds = torch.tensor([x < torch.inf for x in relaxation], device=region.anchor.device)
+    return Region(tuple(sets), region.anchor, holds), tuple(relaxation)
 
 
 def _applied(stages: list[str], order: list[str]) -> list[tuple[str, tuple[int, ...]]]:

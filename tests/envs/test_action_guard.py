@@ -22,7 +22,11 @@ from torchrl.envs import (
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.envs import ActionGuard, constrain_env
-from cnfp_torchrl.modules import ConstraintViolationError, make_constrained_actor
+from cnfp_torchrl.modules import (
+    ConstraintViolationError,
+    RelaxedConstraintError,
+    make_constrained_actor,
+)
 from cnfp_torchrl.tasks.point_nav import (
     POINT_NAV_ID,
     BatteryGeometry,
@@ -30,6 +34,7 @@ from cnfp_torchrl.tasks.point_nav import (
     PointNavEnv,
 )
 from cnfp_torchrl.training.networks import gaussian_network
+from tests.walls import HOLDS, MISSED, Wall, Walls, Window, walls
 
 AGENTS = 16
 
@@ -177,3 +182,36 @@ def test_it_must_see_what_is_executed() -> None:
     env.append_transform(ActionGuard()).append_transform(scaling.clone())
     with pytest.raises(ConstraintViolationError):
         env.rollout(200, actor, break_when_any_done=False)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "how"), [(Wall(), r"relaxed by 2 "), (Window("wall"), "dropped")]
+)
+def test_relaxation_can_be_refused(geometry: Wall, how: str) -> None:
+    def environment(**options: bool) -> TransformedEnv:
+        env = walls(Walls([HOLDS, HOLDS, MISSED], 3), copy.deepcopy(geometry))
+        return env.append_transform(ActionGuard(**options))
+
+    lenient, strict = environment(), environment(refuse_relaxation=True)
+    state = strict.reset()
+    state["action"] = state["constraints", "anchor"].clone()
+    message = rf"constraint 'wall': expected to hold.*it is {how}.*batch index \[2\]"
+    with pytest.raises(RelaxedConstraintError, match=message):
+        strict.step(state.clone())
+    strict.step(state.clone().set("_step", torch.tensor([True, True, False])))
+    lenient.reset()
+    lenient.step(state.clone())
+
+
+def test_a_relaxed_constraint_is_told_from_a_broken_one() -> None:
+    env = walls(Walls([HOLDS, MISSED], 2)).append_transform(ActionGuard())
+    state = env.reset()
+    actions = state["constraints", "anchor"].clone()
+    env.step(state.clone().set("action", actions))
+    for agent, message in enumerate(["inside its set, given", r"inside its set widened by 2,"]):
+        broken = actions.clone()
+        broken[agent, 0] = 0.9
+        with pytest.raises(ConstraintViolationError, match=message) as caught:
+            env.step(state.clone().set("action", broken))
+        assert f"batch index [{agent}]" in str(caught.value)
+        assert not isinstance(caught.value, RelaxedConstraintError)

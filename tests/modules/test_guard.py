@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 from cnfp_torchrl.modules import (
     ConstraintViolationError,
     ExecutedActionGuard,
+    RelaxedConstraintError,
     SafeRandomPolicy,
     flow_head,
     guarded,
@@ -193,3 +194,36 @@ def test_a_guard_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: 
     for wrong in (flow_head(make_actor()), make_tanh_actor()):
         with pytest.raises(TypeError, match=r"actor: expected.*given"):
             ExecutedActionGuard(wrong)
+
+
+@pytest.mark.parametrize(
+    ("amount", "how"),
+    [(0.25, "relaxed by 0.25"), (torch.inf, "dropped")],
+    ids=["relaxed", "dropped"],
+)
+def test_relaxation_can_be_refused(
+    make_actor: MakeActor, acted: TensorDictBase, amount: float, how: str
+) -> None:
+    strict = ExecutedActionGuard(make_actor(), refuse_relaxation=True)
+    assert strict(acted) is acted
+    # The action keeps even the set as stated.
+    gave_way = relaxed(acted.clone(), "battery", amount)
+    ExecutedActionGuard(make_actor())(gave_way.clone())
+    message = rf"constraint 'battery': expected to hold.*it is {how} at batch index \[{AGENT}\]"
+    with pytest.raises(RelaxedConstraintError, match=message):
+        strict(gave_way)
+    # A broken one is another error.
+    with pytest.raises(ConstraintViolationError) as caught:
+        strict(set_action(acted, BREAKING["battery"](acted)))
+    assert not isinstance(caught.value, RelaxedConstraintError)
+
+
+def test_refused_relaxation_reaches_the_guard_of_an_actor(
+    make_actor: MakeActor, state: TensorDictBase
+) -> None:
+    policy = guarded(make_actor(), refuse_relaxation=True)
+    policy(state.clone())
+    with pytest.raises(RelaxedConstraintError, match="'obstacle'"):
+        policy(relaxed(state, "obstacle", 0.1))
+    with pytest.raises(ValueError, match=r"refuse_relaxation: expected False for SquashFlow"):
+        guarded(make_actor(flow="squash"), refuse_relaxation=True)

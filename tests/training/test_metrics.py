@@ -6,12 +6,13 @@ import torch
 from tensordict import TensorDict
 from torchrl.record.loggers import CSVLogger
 
+from cnfp_torchrl.training.constraint_counts import ConstraintTally
 from cnfp_torchrl.training.metrics import Metrics
 
 
 def make_metrics(path: Path, *, interval: int = 100) -> Metrics:
     logger = CSVLogger("metrics", log_dir=str(path))
-    return Metrics([logger], ["wall"], total_frames=1000, interval=interval)
+    return Metrics([logger], ConstraintTally(["wall"]), total_frames=1000, interval=interval)
 
 
 def rows(path: Path, name: str) -> list[list[float]]:

@@ -34,7 +34,19 @@ PLANE_OF_OTHERS: dict[str, ConstraintSet] = {
     "power": PositivePart(t([1.0, 1.0]), t(1.1)),
     "diamond": WeightedL1Ball(t([1.0, 0.8]), t(0.9)),
 }
+
+
+class RigidBall(Ball):
+    """A ball that cannot be widened, and is dropped where it cannot hold."""
+
+    inflated = ConstraintSet.inflated
+
+
 CONFLICT: dict[str, ConstraintSet] = {
+    "far": RigidBall(t([1.3, 1.3]), t(0.5)),
+    "near": Ball(t([-0.5, -0.5]), t(0.6)),
+}
+RELAXED: dict[str, ConstraintSet] = {
     "far": Ball(t([1.3, 1.3]), t(0.5)),
     "near": Ball(t([-0.5, -0.5]), t(0.6)),
 }
@@ -64,10 +76,14 @@ def first(sets: Mapping[str, ConstraintSet], count: int) -> dict[str, Constraint
 def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
     region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
     assert region.active is not None
+    assert region.relaxation is not None
     state = TensorDict({"observation": torch.zeros(3)}, [])
     state["constraints", "anchor"] = region.anchor
     for k, (name, each) in enumerate(sets.items(), start=1):
         state["constraints", name, "active"] = region.active[k]
+        state["constraints", name, "relaxation"] = region.relaxation[k].amax(-1)
+        if each.has_rows():
+            state["constraints", name, "row_relaxation"] = region.relaxation[k]
         for field, value in each.fields().items():
             state["constraints", name, field] = value
     return state

@@ -10,7 +10,7 @@ from cnfp_torchrl.envs import TaskView
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
 from cnfp_torchrl.visual import FlowSnapshot
 from cnfp_torchrl.visual.explanation import ConstraintEffect, Explanation, explain
-from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_snapshot
+from tests.visual.cases import CONFLICT, LINE, PLANE, RELAXED, SPACE, make_snapshot
 
 t = torch.tensor
 STILL = torch.full((2,), 1e-3)
@@ -79,6 +79,17 @@ def test_a_constraint_that_cannot_hold_is_dropped() -> None:
         explanation.text()
     )
     assert "far is dropped" in explanation.markdown()
+
+
+def test_a_constraint_that_is_widened_is_relaxed() -> None:
+    explanation = explain(make_snapshot(RELAXED))
+    assert effects(explanation) == {"far": "relaxed", "near": "restrictive"}
+    far, _ = explanation.constraints
+    # The nearest points of the balls are apart by the distance of their centers without the radii.
+    assert far.relaxation == pytest.approx(1.8 * 2**0.5 - 1.1, abs=0.01)
+    assert far.share_outside == 0
+    for text in (explanation.text(), explanation.markdown()):
+        assert f"relaxed by {far.relaxation:.3g}" in text
 
 
 @pytest.mark.parametrize("flow", ["unconstrained", "squash"])

@@ -16,9 +16,23 @@ from cnfp_torchrl.visual import Scene, Setting
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.scene import PRINTED, Detail, base_density, density_limits
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, stage_bijector
-from tests.visual.cases import CONFLICT, LINE, PLANE, SPACE, make_actor, make_snapshot, make_state
+from tests.visual.cases import (
+    CONFLICT,
+    LINE,
+    PLANE,
+    RELAXED,
+    SPACE,
+    make_actor,
+    make_snapshot,
+    make_state,
+)
 
-CASES = {"three": (PLANE, 2), "one is dropped": (CONFLICT, 2), "on a line": (LINE, 1)}
+CASES = {
+    "three": (PLANE, 2),
+    "one is dropped": (CONFLICT, 2),
+    "one is relaxed": (RELAXED, 2),
+    "on a line": (LINE, 1),
+}
 
 
 def setting_of(snapshot: FlowSnapshot, view: TaskView = NOTHING) -> Setting:
@@ -35,6 +49,8 @@ def scene_of(snapshot: FlowSnapshot, reach: float | None = None, cells: int = 31
 @pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
 @pytest.mark.parametrize("case", CASES)
 def test_last_stage_is_the_policys_log_density(case: str, flow: str) -> None:
+    if flow == "squash" and case == "one is dropped":
+        pytest.skip("some of these sets have no squash")
     sets, dim = CASES[case]
     actor = make_actor(sets, flow, dim=dim, loc=torch.full((dim,), 0.3))
     step = actor(make_state(sets, dim))

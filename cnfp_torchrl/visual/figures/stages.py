@@ -279,8 +279,12 @@ def _stage_title(snapshot: FlowSnapshot, index: int) -> str:
     stage = snapshot.stages[index]
     name = "action bounds" if stage.applied[-1] == 0 else stage.name
     head = f"stage {index + 1}: {name}"
-    if not stage.active:
-        head += " (dropped here)" if snapshot.is_safe else " (cannot hold here)"
+    if not stage.active and not snapshot.is_safe:
+        head += " (cannot hold here)"
+    elif not stage.active:
+        head += (
+            " (dropped here)" if not snapshot.is_active(stage.applied[-1]) else " (relaxed here)"
+        )
     told = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
     return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {told}"
 

@@ -31,6 +31,8 @@ TRAINING_PLOTS: Mapping[str, Sequence[str]] = {
     "Training: alpha": ["train/alpha"],
     "Training: entropy": ["train/entropy"],
     "Training: violations": ["violations/**"],
+    "Training: relaxed and dropped": ["relaxed/**", "dropped/**"],
+    "Training: largest relaxation": ["relaxation/**"],
 }
 """What ``cnfp-train`` logs, with any loss."""
 

@@ -365,9 +365,9 @@ class SeriesPainter:
                 static=True,
             )
         for name, color in setting.colors.items():
-            for metric in (f"violations/{name}", f"train/lambda_{name}"):
+            for metric in ("violations/", "train/lambda_", "relaxed/", "dropped/", "relaxation/"):
                 line = rr.SeriesLines(colors=rgb(color), names=name)
-                path = rr.new_entity_path([style.METRICS, *metric.split("/")])
+                path = rr.new_entity_path([style.METRICS, *f"{metric}{name}".split("/")])
                 self._stream.log(path, line, static=True)
 
     def _color(self, name: str) -> style.Color:

@@ -88,7 +88,7 @@ class RunningViewer(Viewer):
         SinkError: when that is no address of a viewer.
     """
 
-    def __init__(self, url: str = f"rerun+http://{LOOPBACK}:9876/proxy") -> None:
+    def __init__(self, url: str = "rerun+http://127.0.0.1:9876/proxy") -> None:
         parts = urlsplit(url)
         try:
             host, port = parts.hostname, parts.port

@@ -1,0 +1,81 @@
+"""A warning, once, where a constraint gave way in every state that was seen."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cnfp_torchrl.geometry import ConstraintSet, relaxation_floor
+
+STATES = 256
+"""States that a look takes in: of one large batch, or of as many small ones as it needs."""
+
+LOOKS = 64
+"""Looks after which nobody watches any more; each costs one synchronization with the host."""
+
+
+class RelaxedEverywhereWarning(UserWarning):
+    """A constraint could not be had in any state of a larger batch."""
+
+
+class RelaxationWatch:
+    """Warns, once, of constraints that gave way in each state of a larger batch.
+
+    Giving way counts beyond what a set without interior needs
+    (`cnfp_torchrl.geometry.relaxation_floor`): an equality always does that much.
+
+    Args:
+        names: names of the constraints, in order of application.
+        leeway: the leeway of their anchor.
+    """
+
+    def __init__(self, names: Sequence[str], leeway: float) -> None:
+        self._names, self._leeway = tuple(names), leeway
+        self._looks_left = LOOKS if names else 0
+        self._seen = 0
+        self._had: Tensor | None = None
+        self._least: Tensor | None = None
+
+    def __call__(self, sets: Sequence[ConstraintSet], relaxation: Tensor, states: int) -> None:
+        """Look at a batch of states.
+
+        Args:
+            sets: the action bounds and the constraints' sets.
+            relaxation: the amounts, ``(*batch, K + 1)``, the bounds' first.
+            states: number of states in the batch.
+        """
+        if not self._looks_left:
+            return
+        amounts = relaxation[..., 1:].reshape(-1, len(self._names))
+        floor = relaxation_floor(sets, self._leeway)[..., 1:]
+        # Where a set is empty, its rounding, and with it the floor, may be anything.
+        gave_way = (relaxation[..., 1:] > floor) | relaxation[..., 1:].isinf()
+        had, least = ~gave_way.reshape(-1, len(self._names)).all(0), amounts.amin(0)
+        if self._had is not None and self._least is not None and self._had.device == had.device:
+            had, least = had | self._had, torch.minimum(least, self._least)
+        self._had, self._least, self._seen = had, least, self._seen + states
+        if self._seen >= STATES:
+            self._look(had, least)
+
+    def _look(self, had: Tensor, least: Tensor) -> None:
+        missed = [
+            f"'{name}' (by {amount:.3g} or more)"
+            if amount < float("inf")
+            else f"'{name}' (dropped)"
+            for name, held, amount in zip(self._names, had.tolist(), least.tolist(), strict=True)
+            if not held
+        ]
+        if missed:
+            warnings.warn(
+                f"constraint {' and '.join(missed)}: gave way in each of {self._seen} states, "
+                "because no action within the bounds keeps it there, together with the constraints "
+                "of higher priority; look at the units of its set and of the action spec, and at "
+                "its order. What happens then: docs/relaxation.md",
+                RelaxedEverywhereWarning,
+                stacklevel=2,
+            )
+        self._looks_left = 0 if missed else self._looks_left - 1
+        self._seen, self._had, self._least = 0, None, None
