@@ -71,6 +71,10 @@ class StepReader:
         """Return which constraints are active, bool ``(*batch, K)``."""
         return self.head.get_region(states).is_active[..., 1:]
 
+    def amounts(self, states: TensorDictBase) -> Tensor:
+        """Return by how much the constraints are relaxed, ``(*batch, K)``, dropped ones inf."""
+        return self.head.get_region(states).amounts()[..., 1:]
+
     def step(self, env: EnvBase, states: TensorDictBase, action: Tensor) -> Outcome:
         """Step an environment that is in the given states."""
         before = states.clone().set(self.head.action_key, action)

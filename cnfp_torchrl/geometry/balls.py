@@ -318,8 +318,8 @@ class TaskSpaceBall(ConstraintSet):
 def _image_gauge(jacobian: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
     unit = power_of_two(direction.abs().amax(-1))
     image = _image(jacobian, direction / unit.unsqueeze(-1))
-    # The set is unbounded in J's null space. An image that vanishes when squared, in units of the
-    # direction and of J's norm, is replaced before the gauge, not only after it, so that no
+    # The set is unbounded in J's null space. An image that vanishes when squared, beside J's norm
+    # and the direction's length, is replaced before the gauge, not only after it, so that no
     # gradient becomes NaN.
     vanishes = image.abs().amax(-1) < torch.finfo(image.dtype).tiny ** 0.5
     return unit * of_ball(image + vanishes.unsqueeze(-1)).masked_fill(vanishes, 0)

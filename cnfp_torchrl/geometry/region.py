@@ -105,6 +105,20 @@ class Region:
             ),
         )
 
+    def amounts(self) -> Tensor:
+        """Return by how much each set is relaxed, ``(*batch, K + 1)``.
+
+        That of its largest row; 0 where it is active, infinite where it is dropped.
+        """
+        shape = self.shape[:-1]
+        if self.relaxation is not None:
+            largest = [each.amax(-1).expand(shape) for each in self.relaxation]
+            return torch.stack(largest, -1)
+        if self.active is None:
+            return self.anchor.new_zeros(*shape, len(self.sets))
+        dropped = self.anchor.new_full((), torch.inf)
+        return torch.where(self.active, 0.0, dropped).expand(*shape, len(self.sets))
+
     def counts(self, stage: int) -> Tensor | None:
         """Return where a set is not dropped, boolean ``(*batch,)``; None means everywhere."""
         if stage == 0 or self.active is None:

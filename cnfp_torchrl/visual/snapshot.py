@@ -13,8 +13,7 @@ from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import Bijector, has_latent
-from cnfp_torchrl.bijectors.bijector import Stages
+from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head

@@ -1,4 +1,4 @@
-"""Policies that learn nothing, to hold learned ones against."""
+"""Policies that learn nothing, to compare learned ones with."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class ShortestPathPolicy(TensorDictModuleBase):
     """Full speed along the shortest path to the goal, pushed into the allowed region.
 
     Args:
-        head: the flow module of an actor, which knows the region.
-        layout: the map; None takes the reference task.
+        head: The flow module of an actor, which knows the region.
+        layout: The map; None takes the reference task.
     """
 
     def __init__(self, head: ConstrainedFlowModule, layout: Layout | None = None) -> None:
@@ -30,7 +30,7 @@ class ShortestPathPolicy(TensorDictModuleBase):
         observation = tensordict.get("observation")
         position, goal = observation[..., :2], observation[..., 3:]
         waypoint = self.path.to_goal(position, goal)
-        wish = (waypoint - position) / self.path.layout.step_length
-        wish = wish / wish.norm(dim=-1, keepdim=True).clamp(min=1)
-        inside = self.head.get_region(tensordict).eroded().pulled_in(wish)
-        return tensordict.set(self.head.action_key, inside)
+        move = (waypoint - position) / self.path.layout.step_length
+        move = move / move.norm(dim=-1, keepdim=True).clamp(min=1)
+        allowed = self.head.get_region(tensordict).eroded().pulled_in(move)
+        return tensordict.set(self.head.action_key, allowed)

@@ -1,4 +1,4 @@
-"""The dynamics of point navigation, written once, in batched torch, for every environment here."""
+"""The dynamics of point navigation in batched torch, shared by its environments."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from cnfp_torchrl.tasks.point_nav.indicators import (
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 
 Collision = Literal["pass", "block"]
-"""What a collision does: nothing but count (``pass``), or keep the agent in place (``block``)."""
+"""The effect of a collision: it is counted (``pass``), or also stops the agent (``block``)."""
 
 CONSTRAINT_NAMES = ("obstacle", "battery")
-"""The columns of `Transition.cost`."""
+"""The names of the columns of `Transition.cost`."""
 
 
 class State(NamedTuple):
-    """The whole state: what the observation shows, with the battery in whole percent."""
+    """A state of the task: what the observation shows, with the battery in whole percent."""
 
     position: Tensor
     """float32, ``(*batch, 2)``."""
     battery: Tensor
-    """int64 in 0..100, ``(*batch,)``; a float would lose a whole step of range now and then."""
+    """int64 in 0..100, ``(*batch,)``; a float's rounding would at times cost a whole step."""
     goal: Tensor
     """float32, ``(*batch, 2)``."""
 
@@ -59,13 +59,13 @@ class Transition(NamedTuple):
 class PointNavDynamics(nn.Module):
     """Steps and starts of the constrained point navigation task (paper, section Experiments).
 
-    It holds the map as tensors and nothing that changes: `step` and `sample` are functions of their
-    arguments and of the generator. The map is rounded to float32 once, so that a position equal to
+    It holds the map as tensors and no state: `step` and `sample` are functions of their arguments
+    and of the generator. The map is rounded to float32 once, so that a position equal to
     an edge as a float32 number touches that edge.
 
     Args:
-        layout: the map; None takes the reference task.
-        collision: effect of a collision, ``pass`` or ``block``.
+        layout: The map; None takes the reference task.
+        collision: The effect of a collision, ``pass`` or ``block``.
 
     Raises:
         ValueError: for an unknown `collision`, and where rectangles leave no room for starts.
@@ -137,21 +137,21 @@ class PointNavDynamics(nn.Module):
         battery: Any = None,
         goal: Any = None,
     ) -> State:
-        """Draw starting states of the given batch shape; what is given is taken instead of drawn.
+        """Draw starting states; parts that are given replace the drawn ones.
 
         Args:
-            batch: the batch shape.
-            generator: source of the random numbers, advanced by the same amount in any case.
-            position: positions anywhere in the arena, broadcast to ``(*batch, 2)``.
-            battery: charges in whole percent, broadcast to ``(*batch,)``.
-            goal: goals anywhere in the arena, broadcast to ``(*batch, 2)``.
+            batch: The batch shape.
+            generator: The source of random numbers, advanced by the same amount in any case.
+            position: The positions, anywhere in the arena, broadcast to ``(*batch, 2)``.
+            battery: The charges in whole percent, broadcast to ``(*batch,)``.
+            goal: The goals, anywhere in the arena, broadcast to ``(*batch, 2)``.
 
         Raises:
             ValueError: for a given value of the wrong kind, range or shape.
         """
         low, high = self.layout.battery_start
-        wall, place = self.layout.wall, self.cell_low.device
-        charge = torch.randint(low, high + 1, batch, generator=generator, device=place)
+        wall, device = self.layout.wall, self.cell_low.device
+        charge = torch.randint(low, high + 1, batch, generator=generator, device=device)
         return State(
             _take("position", position, self.sample_positions(batch, generator), -wall, wall),
             _take("battery", battery, charge, 0, BATTERY_FULL),
@@ -162,7 +162,7 @@ class PointNavDynamics(nn.Module):
         """Draw positions uniformly from the start region, float32, ``(*batch, 2)``.
 
         The region is cut into cells; a cell is drawn by its share of the area, then a point in it.
-        Unlike rejection this takes the same number of random numbers every time, without a loop.
+        Rejection sampling would draw a varying number of random numbers, in a loop.
         """
         draw = torch.rand(
             (*batch, 3), generator=generator, device=self.cell_low.device, dtype=torch.float64

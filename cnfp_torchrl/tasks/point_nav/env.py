@@ -28,7 +28,7 @@ class PointNavEnv(EnvBase):
     The task of the paper's section Experiments, with the sizes of `Layout`. Episodes have no
     terminal state and are truncated. A reset to a chosen state, for audits and pictures:
     ``env.reset(position=..., battery=..., goal=...)``, any of the three, broadcast over the batch;
-    what is left out is drawn.
+    whichever is left out is drawn.
 
     Keys, with ``*b`` the batch size:
         - ``observation`` float32 ``(*b, 5)``: x, y, battery / 100, goal x, goal y,
@@ -39,13 +39,13 @@ class PointNavEnv(EnvBase):
         - ``done``, ``terminated`` (never), ``truncated`` bool ``(*b, 1)``.
 
     Args:
-        batch_size: number and shape of the agents, which are independent of each other.
-        layout: the map; None takes the reference task.
-        collision: ``pass``, the agent goes on through an obstacle and is clipped at the walls, or
-            ``block``, it stays where it is; both are counted.
-        max_steps: length at which an episode is truncated.
-        device: the device to compute on.
-        seed: seed of starts and goals; None takes one from torch's global generator.
+        batch_size: The shape of the batch of agents, which are independent of each other.
+        layout: The map; None takes the reference task.
+        collision: The effect of a collision, which is counted: with ``pass`` the agent goes on
+            through an obstacle and is clipped at the walls, with ``block`` it stays where it is.
+        max_steps: The length at which an episode is truncated.
+        device: The device to compute on.
+        seed: The seed of starts and goals; None takes one from torch's global generator.
 
     Raises:
         ValueError: for a bad argument, a start state outside the arena, and for an action with NaN
@@ -77,7 +77,7 @@ class PointNavEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.dynamics = PointNavDynamics(layout, collision)
         self.max_steps = max_steps
-        self.dynamics.to(self._place)
+        self.dynamics.to(self._torch_device)
         self._make_specs()
         for name, width, dtype in (
             ("position", (2,), torch.float32),
@@ -85,7 +85,7 @@ class PointNavEnv(EnvBase):
             ("goal", (2,), torch.float32),
             ("steps", (), torch.int64),
         ):
-            value = torch.zeros((*self.batch_size, *width), dtype=dtype, device=self._place)
+            value = torch.zeros((*self.batch_size, *width), dtype=dtype, device=self._torch_device)
             self.register_buffer(name, value)
         self.set_seed(seed)
         self._enter(self.dynamics.sample(self.batch_size, self._generator))
@@ -107,18 +107,18 @@ class PointNavEnv(EnvBase):
     def to(self, device: torch.device | str) -> PointNavEnv:
         """Move the environment; the random numbers of another device differ."""
         super().to(device)
-        if self._generator.device.type != self._place.type:
+        if self._generator.device.type != self._torch_device.type:
             seed = self._generator.initial_seed()
-            self._generator = torch.Generator(self._place).manual_seed(seed)
+            self._generator = torch.Generator(self._torch_device).manual_seed(seed)
         return self
 
     @property
-    def _place(self) -> torch.device:
+    def _torch_device(self) -> torch.device:
         return torch.device("cpu") if self.device is None else self.device
 
     def _make_specs(self) -> None:
-        batch, place, wall = self.batch_size, self._place, self.layout.wall
-        numbers: dict[str, Any] = {"device": place, "dtype": torch.float32}
+        batch, device, wall = self.batch_size, self._torch_device, self.layout.wall
+        numbers: dict[str, Any] = {"device": device, "dtype": torch.float32}
         low = torch.tensor([-wall, -wall, 0.0, -wall, -wall], **numbers).expand(*batch, 5)
         high = torch.tensor([wall, wall, 1.0, wall, wall], **numbers).expand(*batch, 5)
         self.observation_spec = Composite(
@@ -128,7 +128,7 @@ class PointNavEnv(EnvBase):
         )
         self.action_spec = Bounded(-1.0, 1.0, (*batch, 2), **numbers)
         self.reward_spec = Unbounded((*batch, 1), **numbers)
-        flag = Binary(1, (*batch, 1), dtype=torch.bool, device=place)
+        flag = Binary(1, (*batch, 1), dtype=torch.bool, device=device)
         self.full_done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch
         )
@@ -136,7 +136,7 @@ class PointNavEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             seed = int(torch.randint(2**62, ()))
-        self._generator = torch.Generator(self._place).manual_seed(seed)
+        self._generator = torch.Generator(self._torch_device).manual_seed(seed)
 
     def _enter(self, state: State) -> None:
         self.position, self.battery, self.goal = state

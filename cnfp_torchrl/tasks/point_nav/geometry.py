@@ -1,8 +1,8 @@
 r"""The allowed actions of point navigation: a box for the obstacles, a ball for the battery.
 
-`VisibleObstacleGeometry` takes all moves in sight in the box's place. All read the observation
-only, so that they work on any environment that shows it, and count in action units, the
-displacement divided by the step length.
+`VisibleObstacleGeometry` replaces the box by all moves in sight. All read the observation only, so
+that they work on any environment that shows it, and count in action units, the displacement divided
+by the step length.
 
 **What is guaranteed.** Let n be the charge before a step, and let
 
@@ -14,13 +14,13 @@ the way to the nearest station by `ShortestPath`, its turns charged. The two set
 .. math:: D(p) \le reach(n + 1),\quad \text{p outside all rectangles}
 
 from one step to the next for every allowed action, and leave an action open in every such state: 0
-violations, for ever. On the reference layout every start is such a state, the way is the straight
+violations at any time. On the reference layout every start is such a state, the way is the straight
 line to the nearest station, and the safe action lies at least 0.04 action units inside both sets.
 On other layouts it holds from starts with that property, where passages are wider than twice the
 clearance of `ShortestPath`. The obstacle's part alone holds from every position outside the
 rectangles.
 
-With all moves in sight in the box's place, the obstacle's part holds on any layout. The battery's
+With all moves in sight instead of the box, the obstacle's part holds on any layout. The battery's
 part holds where the nearest station is in sight from everywhere, as on the reference layout: a move
 that the battery's ball allows ends where the nearest station is within reach. On other layouts the
 box keeps the way open, which the visible region does not.
@@ -28,7 +28,7 @@ box keeps the way open, which the visible region does not.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -62,9 +62,10 @@ class PointNavGeometry(GeometryTransform):
     """A constraint of point navigation: reads position and charge, knows the map.
 
     Args:
-        layout: the map; None takes the reference task.
-        name: the constraint's name; None takes the usual one.
-        observation_key: key of the observation ``(*batch, 5)``, which must not be rescaled.
+        layout: The map; None takes the reference task.
+        name: The constraint's name; None takes the usual one.
+        observation_key: The key of the observation ``(*batch, 5)``, which must not be rescaled.
+        kwargs: Further options of `GeometryTransform`: ``margin`` and ``resolution``.
     """
 
     usual_name: ClassVar[str]
@@ -74,8 +75,9 @@ class PointNavGeometry(GeometryTransform):
         layout: Layout | None = None,
         name: str | None = None,
         observation_key: str = "observation",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(self.usual_name if name is None else name, [observation_key])
+        super().__init__(self.usual_name if name is None else name, [observation_key], **kwargs)
         self.path = ShortestPath(layout)
         self.layout = self.path.layout
 
@@ -87,10 +89,10 @@ class PointNavGeometry(GeometryTransform):
 class ObstacleGeometry(PointNavGeometry):
     """A box of moves that touch no obstacle and keep the way to the nearest station open.
 
-    For each rectangle the box keeps to the outer side of one of its four edges, prolonged: of those
-    that separate the rectangle from the agent and from the next waypoint, the farthest one. Bounds
+    For each rectangle the box stays on the outer side of one of its four edges, prolonged: the
+    farthest of those that separate the rectangle from the agent and from the next waypoint. Bounds
     keep `MARGIN` from edges and walls and are clipped at the action bounds. They are not clamped to
-    contain 0: an agent that rounding left a hair inside the margin is pushed back.
+    contain 0: an agent that rounding left just inside the margin is pushed back.
 
     Where no move keeps the constraint (the agent touches a rectangle, or is out of reach of the
     arena) the box lies beyond the action bounds, in [2, 3] on the axis of the shortest way out.
@@ -125,11 +127,12 @@ class ObstacleGeometry(PointNavGeometry):
 
 
 class VisibleObstacleGeometry(PointNavGeometry):
-    """All moves whose straight way touches no obstacle: not convex, and less timid than a box.
+    """All moves whose straight path touches no obstacle: not convex, and larger than a box.
 
     Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
-    it is pressed against an obstacle, the box of `ObstacleGeometry` takes the region's place: it
-    may leave out the zero action and so leads away.
+    it is pressed against an obstacle, the box of `ObstacleGeometry` replaces the region: it may
+    leave out the zero action and so leads away. A visible region cannot be moved inwards: a margin
+    or a resolution is refused, by name, when the environment's specs are read.
     """
 
     usual_name = "obstacle"
@@ -139,8 +142,9 @@ class VisibleObstacleGeometry(PointNavGeometry):
         layout: Layout | None = None,
         name: str | None = None,
         observation_key: str = "observation",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(layout, name, observation_key)
+        super().__init__(layout, name, observation_key, **kwargs)
         self._box = ObstacleGeometry(layout, name, observation_key)
         wall = torch.full((2,), self.layout.wall - MARGIN)
         corners = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
@@ -163,17 +167,18 @@ class VisibleObstacleGeometry(PointNavGeometry):
 
 
 class BatteryGeometry(PointNavGeometry):
-    r"""The ball around the next waypoint of what the battery still reaches after this step.
+    r"""The ball of moves after which the battery still reaches a station, around the next waypoint.
 
-    Its radius is :math:`reach(n) - rest`, see the module, with what remains beyond the waypoint;
-    at a waypoint that is no station at least the turning radius. Huge when the battery is full, it
-    closes in on the station as the battery empties.
+    Its radius is :math:`reach(n) - rest`: :math:`reach(n)` as in the module's docstring, rest the
+    length of the way beyond the waypoint. At a waypoint that is no station it is at least the
+    turning radius. The ball is huge when the battery is full, and closes in on the station as the
+    battery empties.
 
-    It also publishes a candidate safe action: towards the waypoint, 0.95 of a step, not beyond it.
+    Publishes a candidate safe action, too: towards the waypoint, 0.95 of a step, not beyond it.
 
     Where no move keeps the constraint (the charge is at the threshold or below) the ball lies
-    beyond the action bounds, in the direction of the waypoint. Where the station is out of reach it
-    is published all the same, and misses the bounds by itself.
+    beyond the action bounds, in the direction of the waypoint. Where the station is out of reach,
+    the ball misses the bounds as it is.
     """
 
     usual_name = "battery"

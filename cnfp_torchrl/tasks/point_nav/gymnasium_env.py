@@ -19,7 +19,7 @@ from cnfp_torchrl.tasks.point_nav.layout import EPISODE_STEPS, Layout
 from cnfp_torchrl.tasks.point_nav.rendering import render_point_nav
 
 POINT_NAV_ID = "cnfp_torchrl/PointNav-v0"
-"""``gymnasium.make`` finds it once `cnfp_torchrl.envs` is imported."""
+"""The id for ``gymnasium.make``, known once `cnfp_torchrl.tasks.point_nav` is imported."""
 
 Array = NDArray[np.float32]
 
@@ -32,9 +32,9 @@ class PointNavGymnasiumEnv(gymnasium.Env[Array, Array]):
     ``reset(options={"position": ..., "battery": ..., "goal": ...})``, any of the three.
 
     Args:
-        layout: the map; None takes the reference task.
-        collision: ``pass`` or ``block``, see `PointNavEnv`.
-        render_mode: None, or ``rgb_array`` for pictures of 512 x 512 pixels.
+        layout: The map; None takes the reference task.
+        collision: The effect of a collision, ``pass`` or ``block``, see `PointNavEnv`.
+        render_mode: The kind of picture: None, or ``rgb_array``, 512 x 512 pixels.
 
     Raises:
         ValueError: for a bad argument or option, and for an action with NaN.
@@ -72,7 +72,7 @@ class PointNavGymnasiumEnv(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode, anywhere or in the state given by the options."""
+        """Start an episode in a drawn state, or in that of the options."""
         super().reset(seed=seed)
         if seed is not None or self._generator is None:
             self._generator = torch.Generator().manual_seed(int(self.np_random.integers(2**62)))
@@ -119,7 +119,7 @@ class PointNavGymnasiumEnv(gymnasium.Env[Array, Array]):
 
 
 def register() -> None:
-    """Make `POINT_NAV_ID` known to Gymnasium; importing `cnfp_torchrl.envs` does it."""
+    """Make `POINT_NAV_ID` known to Gymnasium; importing this package does it."""
     if POINT_NAV_ID not in gymnasium.registry:
         gymnasium.register(
             POINT_NAV_ID,

@@ -1,8 +1,7 @@
 """The constraint indicators of point navigation, computed by the environment from its own state.
 
-Nothing here is used by the geometry that the flow reads, and nothing of that geometry is used here:
-a mistake in one of the two shows up as violations instead of agreeing with itself. Zero tolerance:
-positions and map are float32 numbers, taken as they are and compared in float64.
+They share nothing with the geometry that the flow reads, so that a mistake in one of the two shows
+up as violations. There is no tolerance: positions and map are float32 numbers, compared in float64.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ def segment_touches_rectangle(start: Tensor, end: Tensor, rectangles: Tensor) ->
     """Tell whether the closed segment touches any closed rectangle.
 
     Two convex sets are disjoint exactly when an axis separates them; for a segment and a rectangle
-    the candidates are the x axis, the y axis and the segment's normal. The last one asks on which
-    side of the segment's line each corner lies, ``sign(d x (corner - start))``. A segment of zero
-    length has no normal, all four products are 0, and the point is compared with the rectangle. On
-    the axes the answer is exact; off them the products are rounded to 1e-16 of their size.
+    the candidates are the x axis, the y axis and the segment's normal, which separates where all
+    corners lie on one side of the segment's line by ``sign(d x (corner - start))``. A segment of
+    zero length has no normal: all four products are 0, and the axes decide. On the axes the answer
+    is exact; off them the products are rounded to 1e-16 of their size.
 
     Args:
-        start: one end of the segment, ``(*batch, 2)``.
-        end: the other end, ``(*batch, 2)``.
-        rectangles: ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``; R may be 0.
+        start: The segment's one end, ``(*batch, 2)``.
+        end: The segment's other end, ``(*batch, 2)``.
+        rectangles: The rectangles ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``; R may be 0.
 
     Returns:
         bool, ``(*batch,)``.

@@ -24,17 +24,17 @@ class Layout:
     wherever a tuple is named, so that a configuration file can state a layout.
 
     Args:
-        rectangles: closed obstacles ``(x_low, y_low, x_high, y_high)``; none is fine.
-        stations: the charging stations ``(x, y)``, at least one.
-        wall: coordinate of the walls, which stand at +-wall on both axes.
-        zone_radius: largest distance at which a station charges.
-        step_length: length by which an action a moves the agent, ``step_length * a``.
-        goal_radius: largest distance at which the goal is reached.
-        goal_bonus: the reward for reaching the goal.
-        start_limit: half width of the square that starts and goals are drawn from uniformly.
-        start_margin: margin around every rectangle in which none is drawn.
-        battery_threshold: percentage below which the charge violates the battery constraint.
-        battery_start: lowest and highest charge at the start, both included.
+        rectangles: The closed obstacles ``(x_low, y_low, x_high, y_high)``; there may be none.
+        stations: The charging stations ``(x, y)``, at least one.
+        wall: The coordinate of the walls, which stand at +-wall on both axes.
+        zone_radius: The largest distance at which a station charges.
+        step_length: The length by which an action a moves the agent, ``step_length * a``.
+        goal_radius: The largest distance at which the goal is reached.
+        goal_bonus: The reward for reaching the goal.
+        start_limit: The half width of the square that starts and goals are drawn from uniformly.
+        start_margin: The margin around every rectangle in which none is drawn.
+        battery_threshold: The percentage below which the charge violates the battery constraint.
+        battery_start: The lowest and highest charge at the start, both included.
 
     Raises:
         ValueError: naming the field, what was expected and what was given.
@@ -64,13 +64,13 @@ class Layout:
         self._set("goal_bonus", _number("goal_bonus", self.goal_bonus))
         self._set("rectangles", _tuples("rectangles", self.rectangles, length=4))
         self._set("stations", _tuples("stations", self.stations, length=2))
-        self._check_places()
+        self._check_map()
         self._check_battery()
 
     def _set(self, field: str, value: object) -> None:
         object.__setattr__(self, field, value)
 
-    def _check_places(self) -> None:
+    def _check_map(self) -> None:
         if self.start_limit > self.wall:
             raise ValueError(
                 f"Layout.start_limit: expected at most the wall at {self.wall}, "

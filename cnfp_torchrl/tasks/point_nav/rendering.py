@@ -1,4 +1,4 @@
-"""Pictures of point navigation, drawn with Pillow: no window, no plotting library."""
+"""Pictures of point navigation, drawn with Pillow, without a window or a plotting library."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def render_point_nav(
     """Draw the map, goal, agent with its trail, and the battery with its threshold.
 
     Args:
-        layout: the map.
-        position: the agent's position, in arena units.
-        battery: charge in whole percent.
-        goal: the goal's position, in arena units.
-        trail: positions so far, oldest first; it fades towards the oldest.
-        size: width of the square picture, in pixels.
+        layout: The map.
+        position: The agent's position, in arena units.
+        battery: The charge in whole percent.
+        goal: The goal's position, in arena units.
+        trail: The positions so far, oldest first; the line fades towards the oldest.
+        size: The width of the square picture, in pixels.
 
     Returns:
         uint8, ``(size, size, 3)``.
@@ -110,7 +110,7 @@ class _Canvas:
         width = round(4 * self.unit)
         low = tuple(x - width for x in self.map_low)
         high = tuple(x + self.map_side + width for x in self.map_low)
-        # What of a zone reaches beyond the walls is covered.
+        # Covers the parts of zones beyond the walls.
         side = self.image.width
         for strip in (
             (0, 0, side, low[1]),

@@ -1,11 +1,11 @@
 r"""Shortest paths around the rectangles: to the nearest station, and to a goal.
 
-Two relations between points serve two purposes.
+The two use two relations between points.
 
 *Separable*: for each rectangle one of its four sides, prolonged to a line, has both points on its
 outer side. Then so has every point of any axis-parallel box that keeps to these sides, and it sees
 what the agent saw. The way to a station uses this relation, because the sets of allowed actions are
-built on it (`geometry_transforms`). Its nodes are the stations and the crossings of all rectangle
+built on it (`ObstacleGeometry`). Its nodes are the stations and the crossings of all rectangle
 edges, moved outwards by a clearance, and of the walls, moved inwards: every point of free space
 lies in a cell of that grid and is separable from the cell's corners.
 
@@ -38,7 +38,8 @@ class StationWay(NamedTuple):
     rest: Tensor
     """What remains beyond the waypoint, its turn included; 0 at a station; ``(*batch,)``."""
     turning_radius: Tensor
-    """So near to the waypoint one sees what it sees; 0 at a station; ``(*batch,)``."""
+    """The distance from the waypoint within which all is visible that is visible from it; 0 at a
+    station; ``(*batch,)``."""
     separates: Tensor
     """Which sides (x_low, y_low, x_high, y_high) of each rectangle separate it from both the
     position and the waypoint, bool ``(*batch, R, 4)``; all false where no way was found."""
@@ -48,17 +49,17 @@ class StationWay(NamedTuple):
 
 
 class ShortestPath(nn.Module):
-    r"""Next waypoints on a layout, precomputed once; queries are batched.
+    r"""The next waypoints on a layout: graphs are computed once, queries are batched.
 
     Lengths are in arena units. A turn at a node is charged ``CAUTIOUS * step_length`` plus the
     turning radius on the way to a station: the step that ends at the node may be cut short by that
-    much. Every promise about the battery rests on this charge.
+    much. The battery's guarantee rests on this charge.
 
     Passages narrower than twice the clearance are not used.
 
     Args:
-        layout: the map; None takes the reference task.
-        clearance: distance of the nodes from rectangles and walls; None takes a fifth of a step.
+        layout: The map; None takes the reference task.
+        clearance: The distance of nodes from rectangles and walls; None takes a fifth of a step.
 
     Raises:
         ValueError: when the clearance is not greater than `MARGIN`.
@@ -106,11 +107,11 @@ class ShortestPath(nn.Module):
     def to_goal(self, position: Tensor, goal: Tensor) -> Tensor:
         """Return the next waypoint on the shortest way to a goal, ``(*batch, 2)``.
 
-        The goal itself where it is in sight, or where no way exists.
+        This is the goal itself where it is in sight, or where no way exists.
 
         Args:
-            position: positions, ``(*batch, 2)``.
-            goal: goals, ``(*batch, 2)``.
+            position: The positions, ``(*batch, 2)``.
+            goal: The goals, ``(*batch, 2)``.
         """
         if len(self.corners) == 0:
             return goal
@@ -174,8 +175,8 @@ class ShortestPath(nn.Module):
         corners = grown[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 2)
         free = (side_distances(corners, rectangles) >= clearance - _TOLERANCE).any(-1).all(-1)
         corners = corners[free & (corners.abs() < layout.wall).all(-1)]
-        # With this inflation whoever is near a corner sees what the corner sees; the small charge
-        # per turn lets him go on there instead of stopping at it.
+        # With this inflation an agent near a corner sees what the corner sees; without the small
+        # charge per turn it would stop at the corner instead of going on.
         inflation, turn = 0.5 * clearance, 0.5 * clearance
         edge = visible(corners.unsqueeze(-2), corners, rectangles, inflation)
         lengths = torch.where(edge, _lengths(corners) + turn, torch.inf).fill_diagonal_(0)
@@ -193,8 +194,8 @@ def side_distances(position: Tensor, rectangles: Tensor) -> Tensor:
     """Return the signed distances to the prolonged sides of each rectangle, positive outside.
 
     Args:
-        position: positions, ``(*batch, 2)``.
-        rectangles: rectangles ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``.
+        position: The positions, ``(*batch, 2)``.
+        rectangles: The rectangles ``(x_low, y_low, x_high, y_high)``, ``(R, 4)``.
 
     Returns:
         ``(*batch, R, 4)``, in the order of the rectangle's columns.
@@ -209,10 +210,10 @@ def visible(start: Tensor, end: Tensor, rectangles: Tensor, inflation: float) ->
     The segment is cut by the two slabs of each rectangle; what is left of it lies inside.
 
     Args:
-        start: one end, ``(*batch, 2)``, broadcast against `end`.
-        end: the other end, ``(*batch, 2)``.
-        rectangles: rectangles, ``(R, 4)``.
-        inflation: margin that rectangles are grown by, in arena units.
+        start: The segments' one end, ``(*batch, 2)``, broadcast against `end`.
+        end: The segments' other end, ``(*batch, 2)``.
+        rectangles: The rectangles, ``(R, 4)``.
+        inflation: The margin that rectangles are grown by, in arena units.
 
     Returns:
         bool, ``(*batch,)``.

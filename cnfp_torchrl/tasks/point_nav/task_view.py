@@ -1,4 +1,4 @@
-"""What point navigation shows of itself: its map, the battery, distances in steps, and states."""
+"""The view of point navigation: its map, the battery, distances in steps, and telling states."""
 
 from __future__ import annotations
 
@@ -31,26 +31,27 @@ from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import ShortestPath, side_distances
 
 _CANDIDATES = 1024
+"""At least so many states are drawn to choose a permissive and a restrictive one from."""
+
 _MOST_RESETS = 64
 _LOW = 30
 """Charges of up to this much above the battery's threshold are low, in percent."""
 
 
 class PointNavView(TaskView):
-    """Distances, in arena units and steps, and what the battery still reaches.
+    """Map, distances in arena units and steps, and what the battery still reaches.
 
     Args:
-        layout: the map.
-        env: the environment as it is used; the geometries among its transforms say what the
+        layout: The map.
+        env: The environment as it is used; the geometries among its transforms say what the
             constraints are called, and which observation they read.
-        candidates: number of states to look for telling ones among, about.
     """
 
-    def __init__(self, layout: Layout, env: EnvBase, *, candidates: int = _CANDIDATES) -> None:
+    def __init__(self, layout: Layout, env: EnvBase) -> None:
         known = appended_transforms(env)
         self._geometries = [each for each in known if isinstance(each, PointNavGeometry)]
         self._key = str(self._geometries[0].in_keys[0]) if self._geometries else "observation"
-        self._layout, self._candidates = layout, candidates
+        self._layout = layout
         self.map = _map(layout)
         self.series = [Series("battery", "%", layout.battery_threshold, (0, BATTERY_FULL))]
         self.position_keys = [self._key]
@@ -96,7 +97,7 @@ class PointNavView(TaskView):
         lowest = layout.battery_threshold + 1
         highest = min(layout.battery_threshold + _LOW, BATTERY_FULL)
         full, low = [], []
-        for _ in range(min(-(-self._candidates // shape.numel()), _MOST_RESETS)):
+        for _ in range(min(-(-_CANDIDATES // shape.numel()), _MOST_RESETS)):
             charge = torch.randint(lowest, highest + 1, shape, generator=generator)
             beside = _beside_rectangles(layout, shape, generator) if layout.rectangles else None
             full.append(env.reset(battery=BATTERY_FULL))

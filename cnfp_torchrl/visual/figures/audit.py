@@ -32,7 +32,7 @@ _MARKS: dict[str, dict[str, Any]] = {
     "violates, outside the set": {"marker": "x", "color": "#9A9A9A", "markersize": 4, "mew": 0.8},
     "allowed, left out": {"marker": ".", "color": "#8FCFBB", "markersize": 7, "mew": 0},
     "allowed, in the set": {"marker": ".", "color": "#1F6B58", "markersize": 6, "mew": 0},
-    "leads to where it is dropped": {"marker": "s", "color": "#E69F00", "markersize": 4, "mew": 0},
+    "leads to where it gives way": {"marker": "s", "color": "#E69F00", "markersize": 4, "mew": 0},
     "violates, in the set": {"marker": "X", "color": _FLAW, "markersize": 6, "mew": 0},
 }
 
@@ -79,7 +79,7 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[s
     titles = (
         "unsound\n% of actions in the set",
         "coverage\n% of what the indicators allow",
-        "dropped\n% of states",
+        "relaxed or dropped\n% of states",
         "tightness\n% of the action bounds left open",
     )
     for axes, title in zip(panels, titles, strict=True):
@@ -109,7 +109,7 @@ def _draw_findings(
     *,
     faint: bool,
 ) -> None:
-    shares = (found.unsound, found.coverage, found.dropped)
+    shares = (found.unsound, found.coverage, found.gave_way)
     for axes, share in zip(panels, shares, strict=False):
         _draw_share(axes, share, at, height, color, faint=faint, told=axes is panels[0])
     _draw_spread(panels[3], found.volume, at, height, color, faint=faint)

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from cnfp_torchrl.envs import constrain_env
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import (
     BatteryGeometry,
@@ -12,6 +13,7 @@ from cnfp_torchrl.tasks.point_nav import (
     ObstacleGeometry,
     PointNavEnv,
     ShortestPath,
+    VisibleObstacleGeometry,
 )
 from cnfp_torchrl.tasks.point_nav.geometry import read_observation
 
@@ -213,3 +215,23 @@ def test_a_station_out_of_every_way_is_no_error() -> None:
     ObstacleGeometry(layout).constraint_set(state).validate("obstacle")
     ball = BatteryGeometry(layout).constraint_set(state).validate("battery")
     assert torch.allclose(ball.center[~enclosed], -position[~enclosed] / 0.1)
+
+
+@pytest.mark.parametrize("kind", [BatteryGeometry, ObstacleGeometry])
+def test_margin_and_resolution_move_the_set_inwards(
+    kind: type[BatteryGeometry] | type[ObstacleGeometry],
+) -> None:
+    margin, step = 0.04, 0.02
+    geometry = kind(margin=margin, resolution=step)
+    state = constrain_env(PointNavEnv((500,), seed=0), geometry).reset()
+    state.update(geometry(state.clone()))
+    (bijector,) = geometry.bijectors
+    stated, published = geometry.constraint_set(state), bijector.get_set(state)
+    moved = stated.slack(torch.zeros(500, 2)) - published.slack(torch.zeros(500, 2))
+    # Half of the diagonal of a square grid cell.
+    assert torch.allclose(moved, torch.tensor(margin + step / 2**0.5), atol=1e-4)
+
+
+def test_moves_in_sight_take_no_margin() -> None:
+    with pytest.raises(TypeError, match=r"'obstacle'.*moved inwards"):
+        constrain_env(PointNavEnv((2,)), VisibleObstacleGeometry(margin=0.04))
