@@ -1,4 +1,4 @@
-"""The constraints that an environment publishes, as its transforms tell them."""
+"""The constraints that an environment publishes, read off its transforms."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
 
 
 class ConstraintPublisher(ABC):
-    """A transform of an environment that publishes constraints, and tells which.
+    """The interface of environment transforms that publish constraints.
 
     Implemented by the transforms of `cnfp_torchrl.envs`.
     """
 
     states_order: ClassVar[bool] = False
-    """Whether the list is of all constraints, in their order of application."""
+    """Whether `bijectors` are those of all constraints, in order of application."""
 
     @property
     @abstractmethod
     def bijectors(self) -> list[ConstraintBijector]:
-        """One for each constraint that the transform publishes."""
+        """The modules of the constraints that the transform publishes, one for each."""
 
 
 def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
@@ -32,7 +32,7 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
     that of its geometry transforms.
 
     Args:
-        env: An environment such as `constrain_env` returns; one, no batch of them in workers.
+        env: An environment such as `constrain_env` returns; not a batch of them in workers.
 
     Raises:
         ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out.
@@ -41,7 +41,7 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
         each for each in appended_transforms(env) if isinstance(each, ConstraintPublisher)
     ]
     if publishers:
-        _ = env.observation_spec  # made once, when each constraint is called for its first set
+        _ = env.observation_spec  # made at the first use, by a set of each constraint
     ordered = [each for each in publishers if each.states_order]
     published = [b for each in publishers if not each.states_order for b in each.bijectors]
     bijectors = ordered[-1].bijectors if ordered else published
