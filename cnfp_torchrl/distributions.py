@@ -20,10 +20,10 @@ class NearestLogProb(NamedTuple):
     """Densities of the actions well inside that are nearest to given ones.
 
     Args:
-        log_prob: The log-densities ``(*batch,)``.
-        action: The actions that they are of, ``(*batch, d)``.
-        moved: The distances to the given actions, ``(*batch,)``, in action units; 0 where the given
-            one was well inside.
+        log_prob: log-densities of the nearest actions, ``(*batch,)``.
+        action: nearest actions, ``(*batch, d)``.
+        moved: distances to the given actions, ``(*batch,)``, in action units; 0 for those that were
+            well inside.
     """
 
     log_prob: Tensor
@@ -32,20 +32,21 @@ class NearestLogProb(NamedTuple):
 
 
 class ConstrainedFlow(TransformedDistribution):
-    r"""The distribution of :math:`a = f(z)`, z from the base and f a bijector onto allowed actions.
+    r"""The distribution of :math:`a = f(z)`, z from a base and f a bijector onto allowed actions.
 
     :math:`\log \pi(a) = \log p(z) - \log|\det \partial f/\partial z|` (paper, eq.
     change_of_variables). Every sample, mode and deterministic action lies in the image of the
     bijector, whatever the base.
 
-    Where tanh is saturated in the dtype an action has lost its latent, so that the density of a
-    given action is -inf there. The latent of the last draw is kept: `log_prob` of that very tensor,
-    if it was not changed since, is the density of what was drawn, as with `rsample_and_log_prob`.
+    Where tanh is saturated in the dtype, an action determines its latent no more, and its density
+    is -inf. The latent of the last draw is kept, so that `log_prob` of that very tensor, unless it
+    was changed since, is the density of the draw, as from `rsample_and_log_prob`.
 
     Args:
-        base: over R^d with ``event_shape (d,)``, of float32 or float64; expanded to the batch shape
-            of the bijector where that is larger, so that each set has samples of its own.
-        bijector: from R^d onto the allowed actions.
+        base: distribution over R^d with ``event_shape (d,)``, of float32 or float64; expanded to
+            the batch shape of the bijector where that is larger, so that each set has samples of
+            its own.
+        bijector: bijector from R^d onto the allowed actions.
 
     Raises:
         ValueError: when the base is not a distribution over vectors of the bijector's dimension,
@@ -59,7 +60,7 @@ class ConstrainedFlow(TransformedDistribution):
                 f"{type(base).__name__} with event_shape {tuple(base.event_shape)}; wrap it in "
                 "torch.distributions.Independent(base, 1)"
             )
-        # What TransformedDistribution.__init__ would find out about any list of transforms.
+        # Set here, not by TransformedDistribution.__init__, which works them out at every call.
         self.bijector = bijector
         self.base_dist = _expanded(base, bijector)
         self.transforms = [bijector]
@@ -102,9 +103,9 @@ class ConstrainedFlow(TransformedDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density of actions ``(*sample, *batch, d)``, -inf outside the support.
 
-        By inversion, unless it is the tensor that was drawn last, whose gradient then is that of
-        the draw. A NaN action has a NaN density. On the boundary, where saturated actions of
-        float32 may lie, the density's limit is taken: -inf.
+        Computed by inversion, or, for the tensor that was drawn last, from its latent, with the
+        gradient of the draw. A NaN action has a NaN density. On the boundary, where saturated
+        actions of float32 may lie, the density's limit is taken: -inf.
 
         Raises:
             ValueError: when the value is not floating, not of vectors of d components, or of a
@@ -121,15 +122,15 @@ class ConstrainedFlow(TransformedDistribution):
         interior = self.bijector(torch.full_like(value, value.shape[-1] ** -0.5))
         inside_value = torch.where(inside.unsqueeze(-1), value, interior)
         latent, log_det = self.bijector.inverse_and_log_det(inside_value)
-        # What is scored decides. It may round otherwise than the same inversion did in `contains`,
-        # where an action that is broadcast to a batch of sets had another memory layout.
+        # The inversion that is scored decides, not only that of `contains`, which may round
+        # otherwise: there an action broadcast to a batch of sets had another memory layout.
         inside = inside & has_latent(latent, log_det)
         latent = torch.where(inside.unsqueeze(-1), latent, 0)
         elsewhere = torch.where(undefined, torch.nan, -torch.inf).to(log_det)
         return torch.where(inside, _log_prob(self.base_dist, latent) + log_det, elsewhere)
 
     def entropy(self) -> NoReturn:
-        """Refuse, for a flow's entropy has no closed form.
+        """Refuse to give an entropy, which has no closed form.
 
         Raises:
             NotImplementedError: always; TorchRL's losses then average samples of their own.
@@ -165,19 +166,19 @@ class ConstrainedFlow(TransformedDistribution):
     def nearest_log_prob(self, value: Tensor, depth: float = 1e-3) -> NearestLogProb:
         """Return the density of the action well inside that is nearest to each given one.
 
-        For actions that did not come from a flow, such as demonstrations or offline data, which may
-        lie on the boundary or a hair outside: `log_prob` is -inf there, and behavior cloning on it
-        learns nothing. Nearest means along the ray from the anchor, a bijective form's counterpart
-        of alpha projection; where an action is well inside it stays, and so does its density. ::
+        For actions that did not come from a flow, such as demonstrations or offline data. They may
+        lie on the boundary or slightly outside, where `log_prob` is -inf and behavior cloning
+        learns nothing. Nearest means along the ray from the anchor, as in alpha projection. An
+        action well inside stays as it is, with its own density. ::
 
             scored = actor.get_dist(batch).nearest_log_prob(batch["action"])
             loss = -scored.log_prob.mean()
 
         Args:
-            value: The actions ``(*sample, *batch, d)``, finite.
-            depth: The share of the way from the anchor to the boundary at which to score what lies
-                further out, between 0 and 1; of the order of the square root of the dtype's
-                rounding error or more, for the density to be exact.
+            value: actions ``(*sample, *batch, d)``, finite.
+            depth: share of the ray from the anchor to the boundary that is left ahead of an action,
+                between 0 and 1; at least about the square root of the dtype's rounding error, for
+                the density to be exact.
 
         Raises:
             ValueError: for a depth outside of (0, 1), and for actions that are not finite.
@@ -220,7 +221,7 @@ class ConstrainedFlow(TransformedDistribution):
 
 
 class _Draw:
-    """The latent of an action, and how to recognize the action: by identity, if unchanged."""
+    """A drawn action with its latent."""
 
     def __init__(self, latent: Tensor, action: Tensor) -> None:
         self.latent = latent
@@ -228,26 +229,28 @@ class _Draw:
         self._state = _state(action)
 
     def is_of(self, value: Tensor) -> bool:
-        # Not by equality: equal actions of other latents exist where tanh is saturated. Of an
-        # action that gradients are asked for only later, the density must depend on it.
+        """Tell whether a value is the drawn tensor, unchanged since."""
+        # By identity, not by equality: saturated actions of different latents are equal. A tensor
+        # that gradients were asked for since is another one: its density must depend on it.
         return value is self._action and _state(value) == self._state
 
 
 def _state(action: Tensor) -> tuple[int, bool]:
-    # Tensors of inference mode do not count their changes, and a compiler does not know the count:
-    # there an action must not be changed in place between drawing and scoring it.
+    """Return what changes when an action is changed in place, and whether it needs gradients."""
+    # 0 instead of the version in inference mode, which keeps none, and in compiled code, which
+    # cannot read it: there an action must not be changed in place before it is scored.
     if torch.compiler.is_compiling() or action.is_inference():
         return 0, action.requires_grad
     return action._version, action.requires_grad
 
 
 class ReferenceEntropyFlow(ConstrainedFlow):
-    r"""The same samples, scored jointly by their density in the coordinates of stage 0.
+    r"""A constrained flow whose draws are scored by their density before the retractions.
 
-    `rsample_and_log_prob` and `sample_and_log_prob` leave the retractions' :math:`d \log s` out, so
-    that the negative mean is the entropy of the tanh-squashed base in the action bounds, for which
-    the usual target entropy -d is right and whose gradient is bounded (`docs/method.md`, section 2,
-    Entropy). For losses only; `log_prob` remains the true density.
+    `rsample_and_log_prob` and `sample_and_log_prob` leave out the log-determinant of the
+    retractions. Their negative mean is the entropy of the tanh-squashed base in the action bounds,
+    for which the usual target entropy -d is right and whose gradient is bounded (`docs/method.md`,
+    section 2, Entropy). For losses only: `log_prob` remains the true density.
     """
 
     def _forward_and_scored_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
@@ -287,9 +290,9 @@ def _in_dtype_of(latent: Tensor, action: Tensor) -> Tensor:
 
 
 def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor, Tensor]:
-    """Draw from a base and score the draw.
+    """Return a draw from a base and its log-density.
 
-    A Gaussian's noise is scored where it is drawn: recovering it as (z - loc) / scale would lose it
+    A Gaussian is scored by its noise as drawn, not by ``(z - loc) / scale``, which loses the noise
     to rounding where the scale is small beside the location, and costs more.
     """
     gaussian = _gaussian(base)
@@ -304,13 +307,13 @@ def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor
 
 
 def _log_prob(base: Distribution, latent: Tensor) -> Tensor:
-    # `Independent` cannot score an empty batch.
+    # Not by `Independent`, which cannot score an empty batch.
     gaussian = _gaussian(base)
     return base.log_prob(latent) if gaussian is None else gaussian.log_prob(latent).sum(-1)
 
 
 def _gaussian(base: Distribution) -> Normal | None:
-    """Return the independent Gaussians that a base is made of, None if it is something else."""
+    """Return the Gaussians that a base of independent ones is made of, None for other bases."""
     gaussian = base.base_dist if isinstance(base, Independent) else None
     if type(gaussian) is not Normal or len(gaussian.batch_shape) != len(base.batch_shape) + 1:
         return None

@@ -41,6 +41,9 @@ SAFE_ACTION_KEY = (CONSTRAINTS_KEY, "safe_action")
 RESERVED_NAMES = (ANCHOR_KEY[-1], SAFE_ACTION_KEY[-1])
 """What stands beside the constraints, and therefore names none of them."""
 
+CONSTRAINT_STATES = ("active", "relaxed", "dropped")
+"""What a constraint is in a state: it holds as stated, by a wider set, or not at all."""
+
 LOC_KEY = "loc"
 SCALE_KEY = "scale"
 ACTION_KEY = "action"

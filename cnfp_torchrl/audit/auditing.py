@@ -6,7 +6,7 @@ geometry's sets?
 
 The indicators judge one step. A set may be smaller than what one step allows because it plans
 ahead: a braking car needs the whole way. That lowers the coverage and is no flaw; it is what
-keeps the policy from *dead ends*, states in which the constraint has to be dropped. Whether it
+keeps the policy from *dead ends*, states in which the constraint has to give way. Whether it
 succeeds is seen in two ways: by the allowed actions that lead to a dead end, and by violations in
 rollouts after a state in which the constraint held.
 """
@@ -47,7 +47,7 @@ class AuditSettings:
         steps: length of the rollouts that states are taken from; more where copies need it.
         uniform: also draw states uniformly, where the environment can be put into them.
         examples: number of examples of each kind of flaw that are kept.
-        strict: count dead ends as flaws, for geometry that promises never to be dropped.
+        strict: count dead ends as flaws, for geometry that promises never to give way.
         seed: seed of everything drawn.
 
     Raises:

@@ -69,9 +69,11 @@ class StepReader:
 
     def active(self, states: TensorDictBase) -> Tensor:
         """Return which constraints are active, bool ``(*batch, K)``."""
-        region = self.head.get_region(states)
-        assert region.active is not None
-        return region.active[..., 1:]
+        return self.head.get_region(states).is_active[..., 1:]
+
+    def amounts(self, states: TensorDictBase) -> Tensor:
+        """Return by how much the constraints are relaxed, ``(*batch, K)``, dropped ones inf."""
+        return self.head.get_region(states).amounts()[..., 1:]
 
     def step(self, env: EnvBase, states: TensorDictBase, action: Tensor) -> Outcome:
         """Step an environment that is in the given states."""

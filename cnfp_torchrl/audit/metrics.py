@@ -15,6 +15,8 @@ from cnfp_torchrl.audit.report import TOGETHER, ConstraintMetrics, Executed, Wor
 from cnfp_torchrl.audit.rollouts import Rollouts
 from cnfp_torchrl.audit.samples import Samples, describe_state
 from cnfp_torchrl.audit.statistics import Share, plain, quantiles
+from cnfp_torchrl.geometry import relaxation_floor
+from cnfp_torchrl.keys import CONSTRAINT_STATES
 from cnfp_torchrl.modules import ConstrainedFlowModule
 
 
@@ -26,6 +28,11 @@ class _Subject:
         name: the constraint's name, or `TOGETHER`.
         judged: whether there is an indicator.
         holds: mask of the states in which it is active, ``(n,)``.
+        had: mask of those in which it gives way by no more than a set without interior, ``(n,)``.
+        amount: amount by which it is relaxed, infinite where dropped, ``(n,)``; together the
+            largest one.
+        left: mask of the actions outside the set as it counts: widened where it is relaxed, and
+            none where it is dropped, ``(2 m, n)``.
         inside: mask of the actions in the set, ``(2 m, n)``.
         reached: mask of the actions that count as covered, ``(2 m, n)``.
         violated: mask of the actions that the indicator calls violations, ``(2 m, n)``.
@@ -37,6 +44,9 @@ class _Subject:
     name: str
     judged: bool
     holds: Tensor
+    had: Tensor
+    amount: Tensor
+    left: Tensor
     inside: Tensor
     reached: Tensor
     violated: Tensor
@@ -52,12 +62,16 @@ def measure(samples: Samples, examples: int) -> list[ConstraintMetrics]:
 
 
 def _single(samples: Samples, k: int) -> _Subject:
-    allowed = samples.region.sets[k + 1]
-    inside = allowed.contains(samples.actions)
+    allowed, relaxed = samples.region.sets[k + 1], samples.region.widened()[k + 1]
+    inside, amount = allowed.contains(samples.actions), samples.amounts[:, k]
+    left, floor = ~relaxed.contains(samples.actions), relaxation_floor(samples.region.sets)
     return _Subject(
         name=samples.head.order[k],
         judged=samples.judged[k],
         holds=samples.active[:, k],
+        had=amount <= floor[..., k + 1].nan_to_num(0.0, 0.0),
+        amount=amount,
+        left=left & ~amount.isinf(),
         inside=inside,
         reached=inside,
         violated=samples.violated[..., k],
@@ -69,11 +83,15 @@ def _single(samples: Samples, k: int) -> _Subject:
 
 def _together(samples: Samples) -> _Subject:
     region = samples.region
+    inside = region.contains(samples.actions)
     return _Subject(
         name=TOGETHER,
         judged=any(samples.judged),
         holds=samples.active.all(-1),
-        inside=region.contains(samples.actions),
+        had=samples.active.all(-1),
+        amount=samples.amounts.amax(-1),
+        left=~inside,
+        inside=inside,
         reached=samples.reachable,
         violated=samples.violated.any(-1),
         kept=samples.kept.all(-1),
@@ -86,7 +104,10 @@ def _measure(samples: Samples, subject: _Subject, examples: int) -> ConstraintMe
     m, holds = samples.half, subject.holds
     checked = subject.inside & holds
     unsound = checked & subject.violated
-    escaped = ~subject.inside[:m] & holds
+    escaped, binding = subject.left[:m], ~subject.amount.isinf()
+    if subject.name == TOGETHER:
+        binding = torch.ones_like(holds)
+    relaxed, dropped = ~holds & subject.amount.isfinite(), subject.amount.isinf()
     onwards, dead_ends = _next_states(samples, subject.kept)
     allowed = ~subject.violated[m:]
     possible = allowed.any(0) & ~holds
@@ -96,17 +117,21 @@ def _measure(samples: Samples, subject: _Subject, examples: int) -> ConstraintMe
     def worst(mask: Tensor, depth: Tensor = subject.slack) -> list[dict[str, Any]]:
         return [samples.describe(*pair) for pair in _deepest(mask, depth, examples)]
 
-    dropped = (~holds).nonzero().squeeze(-1)
-    # A drop that the indicators did not call for comes first.
-    dropped = dropped[possible[dropped].int().argsort(descending=True, stable=True)]
+    gave_way = (~holds).nonzero().squeeze(-1)
+    # Where the indicators did not call for it comes first.
+    gave_way = gave_way[possible[gave_way].int().argsort(descending=True, stable=True)]
     return ConstraintMetrics(
         name=subject.name,
         unsound=_share(unsound, checked) if subject.judged else None,
-        escaped=_share(escaped, holds.expand_as(escaped)),
+        escaped=_share(escaped, binding.expand_as(escaped)),
         dead_ends=_share(dead_ends, onwards),
         coverage=_share(covered, coverable) if subject.judged else None,
         binding=_share(covered & binds, coverable & binds) if subject.judged else None,
-        dropped=_share(~holds.unsqueeze(0), torch.ones_like(holds).unsqueeze(0)),
+        relaxed=_share_of_states(relaxed),
+        dropped=_share_of_states(dropped),
+        gave_way=_share_of_states(~holds),
+        had=_share_of_states(subject.had),
+        relaxation=quantiles(subject.amount[relaxed]),
         possible=_share(possible.unsqueeze(0), ~holds.unsqueeze(0)) if subject.judged else None,
         volume=quantiles(subject.inside[m:].double().mean(0)[holds]),
         slack=quantiles(subject.anchor_slack[holds]),
@@ -114,13 +139,13 @@ def _measure(samples: Samples, subject: _Subject, examples: int) -> ConstraintMe
             "unsound": worst(unsound) if subject.judged else [],
             "escaped": worst(_padded(escaped, m), -subject.slack),
             "dead_ends": worst(_padded(dead_ends, m)),
-            "dropped": [samples.describe_state(int(i)) for i in dropped[:examples]],
+            "gave_way": [samples.describe_state(int(i)) for i in gave_way[:examples]],
         },
     )
 
 
 def _next_states(samples: Samples, kept: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the flow's samples that break nothing, and those after which something is dropped.
+    """Return the flow's samples that break nothing, and those after which something gives way.
 
     Only in states where every constraint is active is anything promised about the next state.
     """
@@ -132,6 +157,10 @@ def _next_states(samples: Samples, kept: Tensor) -> tuple[Tensor, Tensor]:
 
 def _share(hits: Tensor, of: Tensor) -> Share:
     return Share.clustered(hits.sum(0), of.sum(0))
+
+
+def _share_of_states(mask: Tensor) -> Share:
+    return _share(mask.unsqueeze(0), torch.ones_like(mask).unsqueeze(0))
 
 
 def _padded(mask: Tensor, rows: int) -> Tensor:
@@ -167,7 +196,7 @@ def worst_state(samples: Samples, name: str, source: str) -> tuple[float, WorstS
     if unsound[s] > 0:
         reason = f"{int(unsound[s])} actions in the set violate"
     elif ends[s] > 0:
-        reason = f"{int(ends[s])} allowed actions lead to where it is dropped"
+        reason = f"{int(ends[s])} allowed actions lead to where it gives way"
     else:
         reason = f"{100 * float(covered[s]):.0f} % of the allowed actions are in the set"
     here = samples.head.get_region(samples.states[s])
@@ -198,15 +227,24 @@ def executed(
     time = torch.arange(steps, device=rollouts.ended.device).unsqueeze(-1).expand(steps, agents)
     begins = torch.cat([torch.ones_like(rollouts.ended[:1]), rollouts.ended[:-1]])
     start = torch.where(begins, time, 0).cummax(0).values
-    active = reader.active(rollouts.states)
-    led_into, shown = {}, {}
+    active, amounts = reader.active(rollouts.states), reader.amounts(rollouts.states)
+    led_into, shown, held, broken = {}, {}, {}, {}
     for k, name in enumerate(head.order):
+        dropped = amounts[..., k].isinf()
+        masks = (active[..., k], ~active[..., k] & ~dropped, dropped)
+        held[name] = {
+            state: int(mask.sum()) for state, mask in zip(CONSTRAINT_STATES, masks, strict=True)
+        }
         if name not in reader.names:
             continue
         bad = rollouts.violated[..., reader.names.index(name)]
         last = torch.where(active[..., k], time, -1).cummax(0).values
         led = bad & (last >= start)
         led_into[name] = int(led.sum())
+        broken[name] = {
+            state: int((bad & mask).sum())
+            for state, mask in zip(CONSTRAINT_STATES, masks, strict=True)
+        }
         # One example an agent: what comes after the first is the same story.
         first = led & (led.cumsum(0) == 1)
         shown[name] = [
@@ -217,4 +255,4 @@ def executed(
         ]
     counts = rollouts.violated.flatten(0, 1).sum(0).tolist()
     violations = dict(zip(reader.names, counts, strict=True))
-    return Executed(steps * agents, violations, led_into, shown)
+    return Executed(steps * agents, violations, led_into, shown, held, broken)

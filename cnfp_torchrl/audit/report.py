@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cnfp_torchrl.audit.statistics import Quantiles, Share
 from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.keys import CONSTRAINT_STATES
 from cnfp_torchrl.text_table import text_table
 
 TOGETHER = "together"
@@ -22,19 +23,27 @@ class ConstraintMetrics:
 
     Args:
         name: the constraint's name, or `TOGETHER`.
-        unsound: share of the actions inside its set that its indicator calls a violation; None
-            without an indicator.
-        escaped: share of the flow's samples that lie outside the set though it is active.
+        unsound: share of the actions inside its set, where it is active, that its indicator calls
+            a violation; None without an indicator.
+        escaped: share of the flow's samples that lie outside the set, widened where it is relaxed.
         dead_ends: share, of the flow's samples that break nothing in states where everything is
-            active, of those that led to a state in which it has to be dropped.
+            active, of those that led to a state in which it gives way.
         coverage: share of the actions that its indicator allows inside its set; together, of those
             that the flow can reach. Where it is active.
         binding: coverage in the states where the set leaves out any tried action.
-        dropped: share of the states in which it is not active; together, in which any is not.
-        possible: share of those in which some tried action keeps the indicator for a step.
+        relaxed: share of the states in which it is relaxed; together, in which one is and none is
+            dropped.
+        dropped: share of the states in which it is dropped; together, in which any is.
+        gave_way: share of the states in which it is either.
+        had: share of the states in which it is active, or relaxed by no more than a set without
+            interior needs (`cnfp_torchrl.geometry.relaxation_floor`).
+        relaxation: quantiles of the amount over the states in which it is relaxed, in units of its
+            slack; together of the largest one.
+        possible: share of the states in which it gives way in which some tried action keeps its
+            indicator for a step.
         volume: quantiles of its share of the action bounds, over the states where it is active.
         slack: quantiles of the anchor's slack, in action units, over the same states.
-        examples: states by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``dropped``),
+        examples: states by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``gave_way``),
             the worst ones first.
     """
 
@@ -44,7 +53,11 @@ class ConstraintMetrics:
     dead_ends: Share
     coverage: Share | None
     binding: Share | None
+    relaxed: Share
     dropped: Share
+    gave_way: Share
+    had: Share
+    relaxation: Quantiles
     possible: Share | None
     volume: Quantiles
     slack: Quantiles
@@ -61,12 +74,17 @@ class Executed:
         led_into: number of those in episodes in which the constraint had been active before:
             allowed actions led from a state where it held to its violation.
         examples: last states in which each constraint was active, with the action.
+        states: number of steps by constraint, then by what it was in their states, see
+            `CONSTRAINT_STATES`.
+        violations_while: number of violations by the same, of constraints with an indicator.
     """
 
     steps: int
     violations: dict[str, int]
     led_into: dict[str, int]
     examples: dict[str, list[dict[str, Any]]]
+    states: dict[str, dict[str, int]]
+    violations_while: dict[str, dict[str, int]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +100,7 @@ class WorstState:
         actions: the actions tried, ``(m, d)``.
         inside: mask of the actions in the constraint's set, ``(m,)``.
         violates: mask of the actions that the indicator calls violations, ``(m,)``.
-        dead_end: mask of the actions after which the constraint had to be dropped, ``(m,)``.
+        dead_end: mask of the actions after which the constraint had to give way, ``(m,)``.
     """
 
     name: str
@@ -135,7 +153,7 @@ class AuditReport:
             *single, together = (self._flaws_of(metrics, source) for metrics in measured)
             # All together fail where one does: reported once.
             yield from [flaw for flaws in single for flaw in flaws] or together
-        yield from self._never_active()
+        yield from self._never_had()
         for name, count in self.executed.led_into.items():
             if count:
                 yield (
@@ -143,24 +161,28 @@ class AuditReport:
                     f"which the constraint was active, in {self.executed.steps} steps"
                 )
 
-    def _never_active(self) -> Iterator[str]:
+    def _never_had(self) -> Iterator[str]:
         for name in self.order:
             found = [x for measured in self.sources.values() for x in measured if x.name == name]
-            states = sum(metrics.dropped.of for metrics in found)
-            if states > sum(metrics.dropped.count for metrics in found):
+            if any(metrics.had.count for metrics in found):
                 continue
-            possible = sum(x.possible.count for x in found if x.possible is not None)
-            if possible:
-                yield (
-                    f"{name}: dropped in all of {states} states, in {possible} of which its "
-                    "indicator allows an action"
-                )
+            relaxed = sum(metrics.relaxed.count for metrics in found)
+            dropped = sum(metrics.dropped.count for metrics in found)
+            least = min((x for m in found if (x := m.relaxation["min"]) is not None), default=0.0)
+            how = [f"relaxed in {relaxed}, by {least:.3g} or more"] if relaxed else []
+            how += [f"dropped in {dropped}"] if dropped else []
+            possible = [metrics.possible.count for metrics in found if metrics.possible is not None]
+            judged = f"; its indicator allows an action in {sum(possible)} of them"
+            yield (
+                f"{name}: holds in none of {relaxed + dropped} states, {', '.join(how)}"
+                f"{judged if possible else ''}"
+            )
 
     def _flaws_of(self, found: ConstraintMetrics, source: str) -> list[str]:
         kinds = [(found.unsound, "actions inside the set violate the indicator")]
-        kinds += [(found.escaped, "samples of the flow lie outside the active set")]
+        kinds += [(found.escaped, "samples of the flow lie outside the set")]
         if self.strict:
-            kinds += [(found.dead_ends, "allowed actions led to where it must be dropped")]
+            kinds += [(found.dead_ends, "allowed actions led to where it gives way")]
         return [
             f"{found.name}, {source}: {share.count} of {share.of} {what}"
             for share, what in kinds
@@ -188,6 +210,10 @@ _SOUNDNESS: _Columns = {
     "unsound": lambda x: _count(x.unsound),
     "escaped": lambda x: _count(x.escaped),
     "dead ends": lambda x: _count(x.dead_ends),
+}
+_RELAXATION: _Columns = {
+    "relaxed": lambda x: _percent(x.relaxed),
+    "by (largest)": lambda x: f"{_number(x.relaxation['median'])} ({_number(x.relaxation['max'])})",
     "dropped": lambda x: _percent(x.dropped),
     "though possible": lambda x: _percent(x.possible),
 }
@@ -197,14 +223,16 @@ _COVERAGE: _Columns = {
     "volume (5-95 %)": lambda x: _percentiles(x.volume),
     "anchor slack (least)": lambda x: f"{_number(x.slack['median'])} ({_number(x.slack['min'])})",
 }
-"""Columns of the two tables, each of which fits a terminal of 100 columns."""
+"""Columns of the three tables, each of which fits a terminal of 100 columns."""
 
 _LEGEND = """\
 unsound: actions inside the active set that the environment's indicator calls violations
-escaped: samples of the flow outside the active set
-dead ends: allowed actions after which the constraint must be dropped
-dropped: states in which the constraint is not active, because it cannot hold or yields to others
-though possible: states of those in which some action keeps its indicator for one step
+escaped: samples of the flow outside the set, widened where it is relaxed
+dead ends: allowed actions after which the constraint gives way
+relaxed: states in which the set is widened, because it cannot hold or yields to others; by how
+  much, in units of its slack, median over them
+dropped: states in which the constraint does not count, for the same reasons
+though possible: states of both in which some action keeps its indicator for one step
 coverage: share of the actions allowed by the indicators, one step ahead, that the set lets the flow
   reach, with a 95 % interval over states; below 100 % is no flaw where a set plans further ahead
 binding: the coverage in states where the set leaves some action out
@@ -218,7 +246,7 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         f"{subject['environment']}, {subject['flow']}, order {' < '.join(report.order)}; states of "
         f"{' and '.join(report.sources)}, policy: {subject['policy']}"
     )
-    for columns in (_SOUNDNESS, _COVERAGE):
+    for columns in (_SOUNDNESS, _RELAXATION, _COVERAGE):
         rows = [["states", "constraint", *columns]]
         for source, measured in report.sources.items():
             rows += [
@@ -228,9 +256,21 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         yield text_table(rows)
     yield _LEGEND
     executed = report.executed
-    rows = [["executed", "violations", "after the constraint had held"]]
-    for name, count in executed.violations.items():
-        rows.append([name, str(count), str(executed.led_into.get(name, "no geometry"))])
+    rows = [
+        [
+            "executed",
+            "violations",
+            *(f"while {each}" for each in CONSTRAINT_STATES),
+            "after it had held",
+        ]
+    ]
+    unjudged = [name for name in report.order if name not in executed.violations]
+    for name in [*executed.violations, *unjudged]:
+        counts = [executed.violations.get(name, "not counted")]
+        while_state = executed.violations_while.get(name, {})
+        counts += [while_state.get(state, "-") for state in CONSTRAINT_STATES]
+        counts += [executed.led_into.get(name, "-" if name in unjudged else "no geometry")]
+        rows.append([name, *map(str, counts)])
     yield f"{text_table(rows)}\nin {executed.steps} steps of the policy"
     if report.notes:
         yield "\n".join(f"note: {note}" for note in report.notes)

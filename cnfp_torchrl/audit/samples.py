@@ -59,8 +59,12 @@ class Samples:
     @property
     def active(self) -> Tensor:
         """Which constraints are active in which state, ``(n, K)``."""
-        assert self.region.active is not None
-        return self.region.active[..., 1:]
+        return self.region.is_active[..., 1:]
+
+    @property
+    def amounts(self) -> Tensor:
+        """By how much each constraint is relaxed in which state, ``(n, K)``, dropped ones inf."""
+        return self.region.amounts()[..., 1:].expand(len(self.states), -1)
 
     def describe(self, row: int, state: int) -> dict[str, Any]:
         """Return one action in its state as plain values."""
@@ -131,13 +135,18 @@ def describe_state(
 ) -> dict[str, Any]:
     """Return a state ``()`` as plain values: its entries, and each constraint's set."""
     region = head.get_region(state)
-    assert region.active is not None
-    flags = region.active[1:].tolist()
+    flags, amounts = region.is_active[1:].tolist(), region.amounts()[1:]
+    given = zip(head.order, region.sets[1:], flags, amounts, strict=True)
     return {
         "state": {_name(key): plain(state.get(key)) for key in keys},
         "sets": {
-            name: {"family": type(allowed).__name__, "active": active, **_plain_fields(allowed)}
-            for name, allowed, active in zip(head.order, region.sets[1:], flags, strict=True)
+            name: {
+                "family": type(allowed).__name__,
+                "active": active,
+                "relaxation": plain(amount),
+                **_plain_fields(allowed),
+            }
+            for name, allowed, active, amount in given
         },
     }
 

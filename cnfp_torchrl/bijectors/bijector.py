@@ -11,11 +11,11 @@ from torch.distributions import Transform, constraints
 
 
 class Stages(NamedTuple):
-    """What a base sample becomes on its way through the stages of a bijector.
+    """The actions that a base sample is mapped to by the first stages of a bijector.
 
     Args:
-        actions: the sample after each stage, ``(stages, *batch, d)``.
-        log_dets: of the map from the base sample to that stage, ``(stages, *batch)``.
+        actions: actions after each stage, ``(stages, *batch, d)``.
+        log_dets: log-determinants of the maps from the base sample to them, ``(stages, *batch)``.
     """
 
     actions: Tensor
@@ -36,13 +36,13 @@ class Image(constraints.Constraint):
 
 
 class Bijector(Transform):
-    """A bijection from R^d onto a set of actions, batched, one set for each batch element.
+    """A bijection from R^d onto a set of actions, one set for each batch element.
 
-    Latent and action have shape ``(*batch, d)``, log-determinants ``(*batch,)``; parameters
+    Latents and actions have shape ``(*batch, d)``, log-determinants ``(*batch,)``; parameters
     broadcast against the batch. A bijector states `forward_and_log_det`, `inverse_and_log_det` and
-    the `shape` of its parameters; one with several stages also `stages`. Everything that
+    the `shape` of its parameters, and `stages` if it has several. All else that
     `torch.distributions` asks of a transform follows from these. It is not verified that forward
-    and inverse agree; the tests do that for every bijector of this package.
+    and inverse agree.
     """
 
     bijective = True
@@ -59,15 +59,15 @@ class Bijector(Transform):
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latent of an action and log|det d latent / d action|.
 
-        Outside the image, and on its boundary, a component of the latent is infinite or NaN. A
-        saturated action lies there too, as far as its dtype can tell: score samples together with
-        drawing them instead.
+        Outside the image and on its boundary a component of the latent is infinite or NaN. So it is
+        for a saturated action, which its dtype cannot tell from the boundary: score samples when
+        they are drawn instead.
         """
 
     def contains(self, action: Tensor) -> Tensor:
         """Tell whether each action lies in the image, an open set: its boundary has no latent.
 
-        The inverse decides. A comparison of its own would round differently, and accept actions
+        Decided by the inverse, not by comparisons, which round differently and would accept actions
         whose latent is infinite.
         """
         with torch.no_grad():
@@ -75,14 +75,14 @@ class Bijector(Transform):
 
     @property
     def shape(self) -> torch.Size:
-        """The shape ``(*batch, d)`` that latents must broadcast to; empty if it takes any."""
+        """The shape ``(*batch, d)`` that latents must broadcast to; empty if any shape will do."""
         return torch.Size()
 
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the action and the log-determinant of stage 0 alone, the map into the bounds.
 
-        That is the log-determinant of the reference entropy (`ReferenceEntropyFlow`). A bijector
-        without retractions is its own reference.
+        For the reference entropy (`ReferenceEntropyFlow`). A bijector without retractions is its
+        own reference.
         """
         return self.forward_and_log_det(latent)
 
@@ -108,7 +108,7 @@ class Bijector(Transform):
 
 
 def has_latent(latent: Tensor, log_det: Tensor) -> Tensor:
-    """Tell where an inversion has found a latent ``(*batch, d)`` with a density, ``(*batch,)``."""
+    """Tell where an inversion has found a finite latent and log-determinant, ``(*batch,)``."""
     return latent.isfinite().all(-1) & log_det.isfinite()
 
 

@@ -15,14 +15,14 @@ class SquashChain(Bijector):
     r"""Apply bijectors in order, :math:`a = f_1(f_2(\dots f_K(z)))` with :math:`f_K` listed first.
 
     The log-determinants add up (paper, eq. normalizing_flow). A chain of squashes is the paper's
-    policy: **only the last bijector's set is guaranteed**, because each one moves what those before
-    it placed. `ExactSquash` is the exact alternative.
+    policy. **Only the last bijector's set is guaranteed**, because each bijector moves actions out
+    of the sets of those before it. `ExactSquash` guarantees all.
 
     Args:
-        bijectors: in order of application, the last has the highest priority.
+        bijectors: bijectors in order of application, the last one with the highest priority.
 
     Raises:
-        ValueError: when there is none.
+        ValueError: when there is no bijector.
     """
 
     def __init__(self, bijectors: Sequence[Bijector]) -> None:

@@ -13,28 +13,29 @@ from cnfp_torchrl.geometry import Region, project_onto_intersection, require_act
 
 
 class NoDensityError(NotImplementedError):
-    """A density was asked for that does not exist: names the map and what to use instead."""
+    """A density that does not exist; names the map and what to use instead."""
 
 
 class Projection(Bijector):
     r"""Squash R^d into the action bounds, then take the closest point of the region.
 
     :math:`a = \arg\min_{a' \in S} |a' - \mathrm{BoxSquash}(z)|`, found by Dykstra's algorithm
-    (`cnfp_torchrl.geometry.project_onto_intersection`), then pulled towards the anchor as far as
-    the rounds of the algorithm did not suffice, so that every action satisfies every active
-    constraint with zero tolerance. Differentiable almost everywhere.
+    (`cnfp_torchrl.geometry.project_onto_intersection`). Where its rounds did not suffice the result
+    is pulled towards the anchor, so that every action satisfies every active constraint with zero
+    tolerance. Differentiable almost everywhere.
 
-    It stands where a bijector stands, but is none: everything outside the region lands on its
-    boundary, whose points have positive probability and no density. Only the reference
+    This is no bijection, though it has a bijector's interface: everything outside the region lands
+    on its boundary, whose points have positive probability and no density. Only the reference
     log-determinant exists, that of the squash into the bounds; it gives the entropy of the action
     before the projection.
 
     Args:
-        region: sets with closed-form projections, anchor and active flags, ``(*batch,)`` of them.
-        rounds: of Dykstra's algorithm, >= 1.
-        validate_args: check the action bounds, which reads them on the host.
+        region: regions of sets with closed-form projections, of batch shape ``(*batch,)``.
+        rounds: number of rounds of Dykstra's algorithm, >= 1.
+        validate_args: whether to check the action bounds, which reads them on the host.
 
     Raises:
+        ValueError: when there are no rounds.
         NoDensityError: when a density, an inverse or stages are asked for.
         TypeError: on mapping, for a set without closed-form projection.
     """

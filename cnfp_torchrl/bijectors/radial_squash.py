@@ -1,4 +1,4 @@
-"""The direct radial squash of R^d onto a region."""
+"""The radial squash of R^d onto a region, without stages."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class RadialSquash(Bijector):
 
     With :math:`\rho = |z|`, :math:`u = z/\rho` and g the region's gauge,
     :math:`\log|\det| = -d \log g(u) + L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)`: the squash into
-    the unit ball, then each ray is stretched to the boundary. Exact in any dimension, useful in one
-    or two: the length of a Gaussian in R^d is near :math:`\sqrt d`, so in many dimensions all
-    samples land on the boundary (`docs/method.md`, section 2).
+    the unit ball, then a stretch of each ray to the boundary. Exact in any dimension, but useful in
+    one or two: the length of a Gaussian in R^d is near :math:`\sqrt d`, so in many dimensions all
+    samples land near the boundary (`docs/method.md`, section 2).
 
     Args:
-        region: sets, anchor and active flags, ``(*batch,)`` of them.
+        region: regions of batch shape ``(*batch,)``.
         validate_args: whether to check the action bounds, which reads them on the host.
 
     Raises:

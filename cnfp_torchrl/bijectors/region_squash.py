@@ -32,23 +32,24 @@ class ExactSquash(Bijector):
 
     Stage 0 is the box squash into the action bounds B, :math:`x = \mathrm{BoxSquash}(z)`. Let c be
     the anchor, :math:`v = x - c`, and :math:`B_k` the intersection of B with the boxes among the
-    first k constraints. What boxes forbid is taken out in each component on its own,
+    first k constraints. Boxes scale each component by itself,
 
     .. math:: w_i = v_i\, \rho_i, \quad \rho_i = room_i(B_k) / room_i(B),
 
-    with :math:`room_i` the distance from c to the side that :math:`v_i` points to, and what the
-    other sets forbid along the ray: with :math:`G_k` the gauge (Minkowski functional) of their
-    intersection with :math:`B_k`, :math:`a_k = c + w/r`, :math:`r = G_k(w)/g_{B_k}(w)`. At the last
-    stage :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| + \sum_i \log \rho_i - d \log r`.
+    with :math:`room_i` the distance from c to the side that :math:`v_i` points to. The other sets
+    scale along the ray, :math:`a_k = c + w/r`, :math:`r = G_k(w)/g_{B_k}(w)`, with :math:`G_k` the
+    gauge (Minkowski functional) of their intersection with :math:`B_k`. At the last stage
+    :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| + \sum_i \log \rho_i - d \log r`.
 
-    A box beside the agent thus leaves the motion along it alone, which a retraction of the whole
-    vector (`GaugeSquash`) shortens with the motion towards it. Without boxes among the constraints
-    both are the same. The log-density jumps where a component of v changes its sign, and where
-    other sets bind it has no limit at the anchor (`docs/method.md`). The image is the region eroded
-    by rounding error: saturated samples satisfy every active constraint with zero tolerance.
+    A box beside the agent thus shortens the motion towards it and leaves the motion along it as it
+    is; a retraction of the whole vector (`GaugeSquash`) shortens both. Without boxes among the
+    constraints the two flows are the same. The log-density jumps where a component of v changes its
+    sign, and where other sets bind it has no limit at the anchor (`docs/method.md`). The image is
+    the region eroded by rounding error, so that saturated samples satisfy every active constraint
+    with zero tolerance.
 
     Args:
-        region: sets, anchor and active flags, ``(*batch,)`` of them.
+        region: regions of batch shape ``(*batch,)``.
         validate_args: whether to check the action bounds, which reads them on the host.
 
     Raises:
@@ -56,17 +57,17 @@ class ExactSquash(Bijector):
     """
 
     scales_by_boxes: ClassVar[bool] = True
-    """Whether boxes are taken out component by component, or along the ray as other sets are."""
+    """Whether boxes scale component by component, not along the ray as other sets do."""
 
     def __init__(self, region: Region, *, validate_args: bool = True) -> None:
         super().__init__()
         if validate_args:
             require_action_bounds(region.bounds)
         self.region = region.eroded()
-        # All stages work in coordinates about the anchor, where the box squash and the gauges have
-        # the same bounds in floating point. Were they a rounding error of the coordinates apart, a
+        # All stages use coordinates about the anchor, not absolute ones, so that the box squash and
+        # the gauges have the same bounds in floating point. Were those a rounding error apart, a
         # gauge of 1 + e at the bounds would let samples overshoot by e times the distance to the
-        # anchor, and near a bound one rounding error is a large e.
+        # anchor, and about an anchor near a bound one rounding error is a large e.
         self._squash = BoxSquash.onto(self.region.bounds).about(region.anchor)
         self._retraction = self._retraction_into(self.region.sets[1:])
 
@@ -89,7 +90,7 @@ class ExactSquash(Bijector):
     def stages(self, latent: Tensor) -> Stages:
         offset, log_slopes = self._squash.forward_and_log_slopes(latent)
         sets = self.region.sets
-        # Each stage is the flow of the constraints so far.
+        # Flows of the first constraints, not one flow cut open: later boxes rescale earlier stages.
         stages = [
             self._retraction_into(sets[1:stage]).forward_and_log_det(offset, log_slopes)
             for stage in range(1, len(sets) + 1)
@@ -101,22 +102,22 @@ class ExactSquash(Bijector):
         )
 
     def _retraction_into(self, sets: Sequence[ConstraintSet]) -> _Retraction:
-        boxes = [each for each in sets if self.scales_by_boxes and isinstance(each, Box)]
-        others = [each for each in sets if not (self.scales_by_boxes and isinstance(each, Box))]
+        boxes = [s for s in sets if self.scales_by_boxes and isinstance(s, Box)]
+        others = [s for s in sets if not (self.scales_by_boxes and isinstance(s, Box))]
         return _Retraction(self._squash.image, boxes, others, self.region.anchor)
 
 
 class GaugeSquash(ExactSquash):
     r"""Squash R^d exactly onto the intersection of all active sets of a region, along rays.
 
-    The exact flow with boxes retracted along the ray, as all other sets are: with :math:`v = x - c`
-    from stage 0, :math:`g_0` the gauge of the bounds and :math:`G_k` that of the region after k
+    The exact flow, but with boxes retracted along the ray like all other sets. With :math:`v = x -
+    c` from stage 0, :math:`g_0` the gauge of the bounds and :math:`G_k` that of the region after k
     constraints, :math:`a_k = c + v/r`, :math:`r = G_k(v)/g_0(v)`. At the last stage
     :math:`\log|\det| = \log|\det \mathrm{BoxSquash}| - d \log r`.
 
     Where nothing binds, r = 1 and the action is that of a tanh-squashed Gaussian. The log-density
-    has no limit at the anchor, where its gradient grows like :math:`1/|v|` (`docs/method.md`). See
-    `ExactSquash` for the arguments.
+    has no limit at the anchor, where its gradient grows like :math:`1/|v|` (`docs/method.md`). The
+    arguments are those of `ExactSquash`.
     """
 
     scales_by_boxes = False
@@ -137,18 +138,18 @@ class _Retraction:
                 low = torch.maximum(low, box.low - anchor)
                 high = torch.minimum(high, box.high - anchor)
             self._scale = _ComponentScale(high / bounds.high, low / bounds.low)
-        self._inner = [each.gauge_about(anchor) for each in others]
+        self._inner = [other.gauge_about(anchor) for other in others]
 
     def forward(self, offset: Tensor) -> Tensor:
         scaled, contraction = self._scaled_and_contraction(offset)
         return self._contracted(scaled, contraction)
 
     def forward_and_log_det(self, offset: Tensor, log_slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action and the log-determinant from the latent on.
+        """Return the action and the log-determinant of the map from the latent to it.
 
         Args:
-            offset: within the action bounds, ``(*batch, d)``.
-            log_slopes: log-derivatives of its components in the latent's, ``(*batch, d)``.
+            offset: offsets within the action bounds, ``(*batch, d)``.
+            log_slopes: log-derivatives of the offset in the latent by component, ``(*batch, d)``.
         """
         scaled, contraction = self._scaled_and_contraction(offset)
         if self._scale is not None:
@@ -159,11 +160,11 @@ class _Retraction:
         return self._contracted(scaled, contraction), log_det
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the offset of an action, and the inverse's log-determinant up to there."""
+        """Return the offset of an action and the log-determinant of the map from it to that."""
         offset = action - self._anchor
         if self._scale is not None:
             offset = self._scale.inverse(offset)
-        # It depends on the direction alone, as the component scale does.
+        # The divisor of the result is that of the offset: it depends on the direction alone.
         _, contraction = self._scaled_and_contraction(offset)
         log_det = torch.zeros_like(offset[..., 0])
         if contraction is not None:
@@ -174,7 +175,7 @@ class _Retraction:
         return offset, log_det
 
     def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the offset after the boxes, and the divisor r that other sets ask for."""
+        """Return the offset scaled by the boxes, and the divisor r of the other sets."""
         ahead, behind = sides(offset)
         scaled = offset if self._scale is None else self._scale.forward(ahead, behind)
         if not self._inner:
@@ -185,7 +186,7 @@ class _Retraction:
     def _contracted(self, scaled: Tensor, contraction: Tensor | None) -> Tensor:
         if contraction is None:
             return self._anchor + scaled
-        # Not a quotient: its gradient takes more passes.
+        # Not a quotient, whose gradient takes more passes.
         return torch.addcmul(self._anchor, scaled, contraction.reciprocal().unsqueeze(-1))
 
 
@@ -213,36 +214,36 @@ class _ComponentScale:
 
     def log_slopes(self, offset: Tensor) -> Tensor:
         r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
-        # Arithmetic with the sign, because masks are slow to make and to convert.
+        # Arithmetic with the sign, not masks, which are slow to make and to convert.
         return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
 
 
 def contraction_along_rays(offset: Tensor, outer_gauge: Tensor, inner: Sequence[Gauge]) -> Tensor:
-    r"""Return the divisor r of an offset that ends in some inner sets too, ``(*batch,)``.
+    r"""Return the divisor r that retracts offsets of an outer set into inner ones, ``(*batch,)``.
 
     :math:`r = \max(1, \max_j g_j(v)/g_{outer}(v))`, and 1 for an offset of zero. Where no inner set
     binds it is exactly 1, and its gradient 0. An inner gauge of NaN makes it NaN: a broken
     constraint must not pass for one that does not bind.
 
     Args:
-        offset: v, points of an outer set minus the anchor, ``(*batch, d)``.
-        outer_gauge: the outer set's gauge of the offset, ``(*batch,)``.
-        inner: the gauges of one or more inner sets about the anchor.
+        offset: points of the outer set minus the anchor, v, ``(*batch, d)``.
+        outer_gauge: gauge of the outer set at the offset, ``(*batch,)``.
+        inner: gauges of one or more inner sets about the anchor.
     """
-    # In one dimension a direction is a sign and has no gradient; computed, its exact zero would be
-    # rounding error over the length.
+    # In one dimension a direction is a sign, without a gradient. The exact zero would be computed
+    # as rounding error over length.
     if offset.shape[-1] == 1:
         offset, outer_gauge = offset.detach(), outer_gauge.detach()
-    # An offset of zero has no direction, and one so short that gradients, which grow like 1/length,
-    # could overflow when squared, has none to speak of. It is given one, so that nothing becomes
-    # NaN, and a ray to the boundary on which no set binds.
+    # An offset of zero has no direction. It gets an arbitrary one, so that nothing becomes NaN, and
+    # an outer gauge with which no set binds. So do offsets so short that gradients, which grow like
+    # 1/length, could overflow when squared.
     shortest = torch.finfo(offset.dtype).tiny ** 0.4
     direction = offset + (outer_gauge <= shortest).unsqueeze(-1)
     gauges = [gauge(direction) for gauge in inner]
     if len(gauges) == 1:
         largest = gauges[0]
     else:
-        # Not one maximum after the other: each gradient costs as much as that of all at once.
+        # Not one maximum after the other, each of whose gradients costs as much as this one's.
         largest = torch.stack(torch.broadcast_tensors(*gauges)).amax(0)
-    # The larger one of it and 1; the gradient of clamp takes more passes.
+    # The maximum of the ratio and 1; not clamp, whose gradient takes more passes.
     return threshold(largest / threshold(outer_gauge, shortest, torch.inf), 1, 1)

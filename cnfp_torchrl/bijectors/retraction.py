@@ -17,11 +17,11 @@ class Retraction(Bijector):
     :math:`\log|\det| = -d \log r`.
 
     Args:
-        outer: the set that the argument lies in, bounded in every direction. It is not eroded here:
-            a squash onto it leaves its margin already, and an argument beyond it by a rounding
-            error would leave the inner set by that error's share of the distance to the boundary.
-        inner: the set to retract into.
-        anchor: a point strictly inside both, ``(*batch, d)``.
+        outer: set that arguments lie in, bounded in every direction. It is not eroded here, because
+            a squash onto it has left a margin already. An argument beyond it by a rounding error
+            would leave the inner set by the same share of the distance to the boundary.
+        inner: set to retract into; it is eroded here.
+        anchor: points strictly inside both sets, ``(*batch, d)``.
     """
 
     def __init__(self, outer: ConstraintSet, inner: ConstraintSet, anchor: Tensor) -> None:
@@ -47,7 +47,7 @@ class Retraction(Bijector):
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         offset = action - self._anchor
         progress, contraction = self._progress_and_contraction(offset)
-        # A way that leaves the outer set has no argument.
+        # Rays that would leave the outer set have no argument.
         contraction = torch.where(progress * contraction < 1, contraction, torch.nan)
         latent = self._anchor + offset * contraction.unsqueeze(-1)
         return latent, action.shape[-1] * contraction.log()

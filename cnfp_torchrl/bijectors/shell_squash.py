@@ -32,12 +32,13 @@ class ShellSquash(Bijector):
     action jumps there, and the log-determinant grows like :math:`-(d - 1) \log \rho`.
 
     Args:
-        center: m, ``(*batch, d)``.
-        inner: radius of the hole, ``(*batch,)``.
-        outer: outer radius, ``(*batch,)``.
-        region: further sets that actions must satisfy, with center m; it must reach beyond the hole
-            along every ray. A ray on which it does not gives NaN, which environments refuse.
-        validate_args: check the arguments, which reads them on the host.
+        center: centers m, ``(*batch, d)``.
+        inner: radii of the hole, ``(*batch,)``.
+        outer: outer radii, ``(*batch,)``.
+        region: regions of further sets that actions must satisfy, with m as the anchor. They must
+            reach beyond the hole along every ray; a ray on which they do not gives NaN, which
+            environments refuse.
+        validate_args: whether to check the arguments, which reads them on the host.
 
     Raises:
         GeometryError: unless 0 < inner < outer, both finite, with room between them for the dtype.
@@ -83,7 +84,7 @@ class ShellSquash(Bijector):
         direction, unit_length, width = self._rays(offset)
         radius = vector_norm(offset, dim=-1)
         depth = (radius - self._inner) / width
-        # The hole has no latent, whereas artanh has negative values.
+        # NaN in the hole, which has no latent, not the negative values of artanh.
         rho = torch.where(depth > 0, depth, torch.nan).atanh()
         latent = direction * (rho / unit_length).unsqueeze(-1)
         return latent, -self._log_det(rho, radius, width, action.shape[-1])
@@ -97,7 +98,7 @@ class ShellSquash(Bijector):
             _, gauge = self._region.outer_and_inner_gauge(direction)
             outer = torch.minimum(outer, unit_length / gauge)
         width = outer - self._inner
-        # A ray on which the region ends inside the hole has no allowed action: say so, loudly.
+        # NaN, not a width of 0, on rays without an allowed action: the region ends in the hole.
         return direction, unit_length, torch.where(width > 0, width, torch.nan)
 
     @staticmethod

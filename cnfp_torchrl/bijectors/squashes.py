@@ -1,8 +1,8 @@
-r"""The paper's tanh squashes into a box, a ball, an ellipsoid, and the functions they consist of.
+r"""The paper's tanh squashes into a box, a ball or an ellipsoid, and their hyperbolic functions.
 
-The hyperbolic functions have values and gradients that are stable at any argument. Those of a
-length take its square :math:`q = \rho^2`, in which they are smooth at 0; below `SMALL` they are
-their power series, whose first neglected term is under float64's rounding error there.
+The functions have stable values and gradients at any argument. Functions of a length
+:math:`\rho` take its square q, in which they are smooth at 0. Below `SMALL` they are power series,
+whose first neglected term is less than the rounding error of float64 there.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class BoxSquash(Bijector):
 
     @classmethod
     def onto(cls, image: Box) -> Self:
-        """Return the squash onto a box that is checked and eroded already."""
+        """Return the squash onto a box that is already checked and eroded."""
         squash = cls.__new__(cls)
         squash._set_image(image)
         return squash
@@ -78,7 +78,7 @@ class BoxSquash(Bijector):
         self._log_slope_scale = (4 * self._half).log()
 
     def about(self, anchor: Tensor) -> Self:
-        """Return the squash in coordinates about a point ``(*batch, d)``: actions minus it."""
+        """Return the squash whose actions are given minus a point ``(*batch, d)``."""
         squash = type(self).__new__(type(self))
         Bijector.__init__(squash)
         squash._middle = self._middle - anchor
@@ -91,7 +91,7 @@ class BoxSquash(Bijector):
 
     @property
     def image(self) -> Box:
-        """The closure of the image, with bounds as saturated samples reach them."""
+        """The closure of the image, with the bounds as computed for saturated samples."""
         low, high = self._middle - self._half, self._middle + self._half
         return Box(low, high, validate_args=False)
 
@@ -151,8 +151,8 @@ class BallSquash(_UnitBallImage):
     eroded by rounding error. Source: paper, section Method.
 
     Args:
-        center: m, ``(*batch, d)``.
-        radius: r, ``(*batch,)``.
+        center: centers m, ``(*batch, d)``.
+        radius: radii r, ``(*batch,)``.
         validate_args: whether to check the arguments, which reads them on the host.
 
     Raises:
@@ -185,8 +185,8 @@ class EllipsoidSquash(_UnitBallImage):
     ellipsoid eroded by rounding error. Source: paper, section Method.
 
     Args:
-        center: m, ``(*batch, d)``.
-        scale_tril: T, lower triangular with a positive diagonal, ``(*batch, d, d)``.
+        center: centers m, ``(*batch, d)``.
+        scale_tril: matrices T, lower triangular with positive diagonals, ``(*batch, d, d)``.
         validate_args: whether to check the arguments, which reads them on the host.
 
     Raises:
@@ -198,7 +198,7 @@ class EllipsoidSquash(_UnitBallImage):
         super().__init__()
         whole = Ellipsoid(center, scale_tril, validate_args=validate_args)
         self._image = whole.eroded()
-        # Erosion leaves a speck of an ellipsoid that is too thin for it, not an empty set.
+        # Compared, not tested for being positive: erosion never empties an ellipsoid.
         if validate_args and not bool((_diagonal(self._image) > _diagonal(whole) / 10).all()):
             raise GeometryError(
                 f"EllipsoidSquash: expected an ellipsoid wider than rounding error in "
@@ -225,16 +225,16 @@ PAPER_SQUASHES: dict[type[ConstraintSet], Callable[..., Bijector]] = {
     Ball: BallSquash,
     Ellipsoid: EllipsoidSquash,
 }
-"""Families and their squashes, which take the family's fields; other families may be added."""
+"""Squashes that take a family's fields, by family; others may be added."""
 
 
 def paper_squash(constraint_set: ConstraintSet) -> Bijector:
     """Return the paper's analytic squash of R^d onto one set, without checking its fields.
 
     Raises:
-        TypeError: when the family has none; `ExactSquash` handles every family.
+        TypeError: when the family has no squash; `ExactSquash` handles every family.
     """
-    # A plain look-up, because torch.compile cannot trace functools.singledispatch.
+    # A plain look-up, not functools.singledispatch, which torch.compile cannot trace.
     squash = PAPER_SQUASHES.get(type(constraint_set))
     if squash is None:
         raise TypeError(
@@ -247,7 +247,7 @@ def paper_squash(constraint_set: ConstraintSet) -> Bijector:
 
 def squash_to_unit_ball(latent: Tensor) -> tuple[Tensor, Tensor]:
     """Return the radial squash of R^d into the unit ball and its log-determinant."""
-    # Latents whose square is out of range are squashed in units of their size.
+    # In units of the latent's size, whose square may be out of range.
     unit = power_of_two(latent.abs().amax(-1).clamp(min=1))
     scaled = latent / unit.unsqueeze(-1)
     q = scaled.square().sum(-1)
@@ -266,9 +266,9 @@ def log_sech_squared(x: Tensor) -> Tensor:
 
 
 def tanhc(q: Tensor, unit: Tensor | float = 1.0) -> Tensor:
-    r"""Return :math:`\tanh(u \rho)/\rho` of :math:`q = \rho^2 \ge 0` and a unit u >= 1.
+    r"""Return :math:`\tanh(u \rho)/\rho` with :math:`q = \rho^2 \ge 0` and a unit u >= 1.
 
-    The unit is 1 where q < `SMALL`.
+    The unit must be 1 where q < `SMALL`.
     """
     small = q < SMALL
     rho = torch.where(small, 1.0, q).sqrt()
@@ -282,9 +282,9 @@ def radial_log_det(q: Tensor, dim: int, unit: Tensor | float = 1.0) -> Tensor:
     :math:`L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)` at :math:`\rho = |z|`.
 
     Args:
-        q: :math:`|z/u|^2`, ``(*batch,)``.
+        q: squared lengths :math:`|z/u|^2`, ``(*batch,)``.
         dim: dimension d.
-        unit: u >= 1, ``(*batch,)``; 1 where q < `SMALL`.
+        unit: units u >= 1 of the lengths, ``(*batch,)``; 1 where q < `SMALL`.
     """
     small = q < SMALL
     near_q = torch.where(small, q, 0.0)
@@ -297,7 +297,7 @@ def radial_log_det(q: Tensor, dim: int, unit: Tensor | float = 1.0) -> Tensor:
 
 
 def atanhc(q: Tensor) -> Tensor:
-    r"""Return :math:`\mathrm{artanh}(\rho)/\rho` of :math:`q = \rho^2 \in [0, 1)`."""
+    r"""Return :math:`\mathrm{artanh}(\rho)/\rho` with :math:`q = \rho^2 \in [0, 1)`."""
     small = q < SMALL
     rho = torch.where(small, 0.5, q).sqrt()
     return torch.where(small, _series(_ATANHC, torch.where(small, q, 0.0)), rho.atanh() / rho)

@@ -1,4 +1,4 @@
-"""Actions of others, moved to where a bijector's densities are finite."""
+"""Given actions, moved to where a bijector's densities are finite."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ _HALVINGS = 30
 
 
 def reach(bijector: Bijector, action: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a point of the image, and how far the image goes from it towards each action.
+    """Return an origin in the image, and how far the image reaches from it towards actions.
 
-    The point is the anchor, where the bijector has one, else the action of latent 0. The images of
-    this package's bijectors are star-shaped about it.
+    The origin is the anchor of the bijector's region, or the action of latent 0 if it has none. The
+    images of this package's bijectors are star-shaped about it.
 
     Args:
-        bijector: The bijector.
-        action: The actions ``(*batch, d)``, finite, inside of the image or not.
+        bijector: bijector with the image.
+        action: actions ``(*batch, d)``, finite, inside the image or outside.
 
     Returns:
-        The point ``(*batch, d)``, and the largest share ``(*batch,)`` of the way from it to the
-        action that remains in the image: below 1 the action is outside.
+        The origin ``(*batch, d)``, and the share ``(*batch,)`` of the line from it to the action
+        that lies in the image, below 1 if the action is outside.
     """
     region = getattr(bijector, "region", None)
     if region is None:
@@ -31,19 +31,19 @@ def reach(bijector: Bijector, action: Tensor) -> tuple[Tensor, Tensor]:
         return origin, _bisected(bijector, origin, action - origin)
     offset = action - region.anchor
     length = vector_norm(offset, dim=-1)
-    # Along a unit vector, which gauges are homogeneous in, so that far actions do not overflow.
+    # The gauge of a unit vector, times the length, not of the offset, which may overflow.
     unit = offset / torch.where(length > 0, length, 1).unsqueeze(-1)
     gauge = region.outer_and_inner_gauge(unit)[1] * length
     return region.anchor.expand_as(action), gauge.reciprocal()
 
 
 def well_inside(bijector: Bijector, action: Tensor, depth: float) -> Tensor:
-    """Return each action, pulled along a ray until a share of the way to the boundary is left.
+    """Return actions pulled towards the origin of `reach`, if they are too near the boundary.
 
     Args:
-        bijector: The bijector whose image the actions are pulled into.
-        action: The actions ``(*batch, d)``, finite.
-        depth: The share of the way from the point of `reach` to the boundary that is left.
+        bijector: bijector whose image the actions are pulled into.
+        action: actions ``(*batch, d)``, finite.
+        depth: share of the ray from the origin to the boundary that is left ahead of an action.
     """
     origin, share = reach(bijector, action)
     kept = ((1 - depth) * share).clamp(max=1).unsqueeze(-1)
@@ -51,7 +51,7 @@ def well_inside(bijector: Bijector, action: Tensor, depth: float) -> Tensor:
 
 
 def _bisected(bijector: Bijector, origin: Tensor, offset: Tensor) -> Tensor:
-    """Return the share of an offset that remains in the image, up to twice the offset."""
+    """Return the share of an offset that lies in the image, at most 2, by bisection."""
     low = torch.zeros_like(offset[..., 0])
     high = torch.full_like(low, 2.0)
     for _ in range(_HALVINGS):

@@ -22,7 +22,7 @@ from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_boun
 from cnfp_torchrl.geometry.superlevel import Cone
 
 MOST_SKEWED = 1e15
-"""The largest element of an ellipsoid's inverse, in units of the smallest diagonal element."""
+"""The largest norm of ``T^-1`` of a valid ellipsoid, in units of T's smallest diagonal element."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class Ball(ConstraintSet):
     r"""The ball :math:`\{a : |a - center| \le radius\}`.
 
     Args:
-        center: ``(*batch, d)``.
-        radius: ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
+        center: centers ``(*batch, d)``, finite.
+        radius: radii ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -84,8 +84,9 @@ class Ball(ConstraintSet):
         return Cone(identity, -self.center, self.radius, torch.ones_like(self.radius))
 
     def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
-        # The radius alone, because torch.where is slow where the mask broadcasts. A far center's
-        # distance is known up to rounding error, which may be larger than what is to be added.
+        # The radius alone is replaced, not the center, because torch.where is slow where the mask
+        # broadcasts. The distance of a far center has a rounding error that may exceed what is
+        # added to it, so that is added, too.
         distance = length(center - self.center)
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         beyond = torch.add(distance, distance, alpha=eps) + radius
@@ -96,8 +97,8 @@ class Ball(ConstraintSet):
     def inner_ball(self, radius: float) -> Self:
         r"""Return the ball of at most the given radius inside this one that is nearest to 0.
 
-        Its anchor is :math:`m \max(0, 1 - (r - \rho)/|m|)` with :math:`\rho = \min(r, radius)`: 0
-        when this ball has room for it there, and on the way to this ball's center m otherwise.
+        Its center is :math:`m \max(0, 1 - (r - \rho)/|m|)` with :math:`\rho = \min(r, radius)`,
+        m and r being center and radius of this ball: 0 if there is room, else between 0 and m.
         """
         inner = self.radius.clamp(max=radius)
         distance = length(self.center)
@@ -111,8 +112,8 @@ class Ellipsoid(ConstraintSet):
     r"""The ellipsoid :math:`\{m + T x : |x| \le 1\}` with T lower triangular.
 
     Args:
-        center: m, ``(*batch, d)``.
-        scale_tril: T, ``(*batch, d, d)``, zero above its positive diagonal.
+        center: centers m, ``(*batch, d)``, finite.
+        scale_tril: matrices T, ``(*batch, d, d)``, zero above their positive diagonals.
     """
 
     center: Tensor
@@ -137,7 +138,7 @@ class Ellipsoid(ConstraintSet):
         return f"expected a square 'scale_tril' (*batch, d, d), given {rows} by {columns}"
 
     def whiten(self, vector: Tensor) -> Tensor:
-        """Return ``T^-1 vector``, the vector in coordinates where the ellipsoid is a unit ball."""
+        """Return ``T^-1 vector``, in coordinates in which the ellipsoid is a unit ball."""
         return _solve(self.scale_tril, vector)
 
     def slack(self, action: Tensor) -> Tensor:
@@ -162,8 +163,8 @@ class Ellipsoid(ConstraintSet):
         return Bounds(self.center - half, self.center + half)
 
     def inflated(self, by: Tensor) -> Self:
-        # Not a share of T, which may be out of range beside a large amount. What `eroded` takes
-        # from the longer axes is added: `rounding` knows the shorter ones alone.
+        # Not T plus a share of T, which may be out of range beside a large amount. What `eroded`
+        # takes from the longer axes is added, because `rounding` counts the shorter ones alone.
         unit, scale_tril = self._in_units()
         norm = spectral_norm_bound(self._inverse())
         eps = 2 * EROSION_IN_EPS * torch.finfo(self.dtype).eps
@@ -176,8 +177,8 @@ class Ellipsoid(ConstraintSet):
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        # An ellipsoid thinner than its rounding error must not turn inside out. In a region it was
-        # inflated by more than that.
+        # Clamped, so that an ellipsoid thinner than its rounding error does not turn inside out;
+        # a region keeps such a set only after it was inflated by more than that.
         unit, _ = self._in_units()
         relative = self._size() / unit
         share = (1 - eps * relative * spectral_norm_bound(self._inverse())).clamp(min=eps)
@@ -195,14 +196,14 @@ class Ellipsoid(ConstraintSet):
         return Cone(inverse, -_solve(scale_tril, self.center), unit, spectral_norm_bound(inverse))
 
     def _size(self) -> Tensor:
-        """Return the size of the numbers that enter, ``(*batch,)``."""
+        """Return the size of the numbers whose rounding errors add up, ``(*batch,)``."""
         return length(self.scale_tril.flatten(-2)) + length(self.center)
 
     def _identity(self) -> Tensor:
         return torch.eye(self.dim, dtype=self.dtype, device=self.scale_tril.device)
 
     def _in_units(self) -> tuple[Tensor, Tensor]:
-        """Return the shortest half-axis u, or so, as a power of two, and ``T / u``.
+        """Return about the shortest half-axis u, as a power of two, and ``T / u``.
 
         In such units an inverse, and what it is applied to, have sizes that can be squared.
         """
@@ -226,14 +227,15 @@ def _solve(scale_tril: Tensor, vector: Tensor) -> Tensor:
 class TaskSpaceBall(ConstraintSet):
     r"""The set :math:`\{a : |J a + b| \le radius\}`, convex; unbounded if J has a null space.
 
-    With J a manipulator's Jacobian and a its joint velocities: a limit of the end effector's speed
-    (b = 0), or of the distance to a wanted velocity -b. With J some rows of the identity: a ball in
-    some of the components. Where J is zero every action passes if b is short enough, else none.
+    With J a manipulator's Jacobian and a its joint velocities, it limits the end effector's speed
+    (b = 0) or the distance to a wanted velocity -b. With some rows of the identity as J, it is a
+    ball in some of the components. A J of zero lets every action pass if :math:`|b| \le radius`,
+    else none.
 
     Args:
-        jacobian: J, ``(*batch, m, d)``, finite.
-        offset: b, ``(*batch, m)``, finite.
-        radius: ``(*batch,)``, finite, 0 or more.
+        jacobian: matrices J, ``(*batch, m, d)``, finite.
+        offset: vectors b, ``(*batch, m)``, finite.
+        radius: radii ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -276,7 +278,7 @@ class TaskSpaceBall(ConstraintSet):
         return self.gauge_about(anchor)(direction)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        # In units of J's norm: what vanishes does so beside it, not beside one.
+        # In units of J's norm, not of one: a small J alone must not make images vanish.
         norm = self._norm()
         offset = _image(self.jacobian, anchor) + self.offset
         jacobian = self.jacobian / norm[..., None, None]
@@ -296,7 +298,7 @@ class TaskSpaceBall(ConstraintSet):
         return type(self)(self.jacobian, self.offset, radius, validate_args=False)
 
     def _size(self, magnitude: Tensor | float) -> Tensor:
-        """Return the size of the numbers that enter, ``(*batch,)``."""
+        """Return the size of the numbers whose rounding errors add up, ``(*batch,)``."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.radius.device)
         terms = self.jacobian.abs().sum(-1) * largest.unsqueeze(-1) + self.offset.abs()
         return self.radius + length(terms)
@@ -316,8 +318,9 @@ class TaskSpaceBall(ConstraintSet):
 def _image_gauge(jacobian: Tensor, of_ball: Gauge, direction: Tensor) -> Tensor:
     unit = power_of_two(direction.abs().amax(-1))
     image = _image(jacobian, direction / unit.unsqueeze(-1))
-    # In J's null space the set has no end. A direction whose image vanishes when squared, beside
-    # its own length and J's norm, is given another one there, so that nothing becomes NaN.
+    # The set is unbounded in J's null space. An image that vanishes when squared, beside J's norm
+    # and the direction's length, is replaced before the gauge, not only after it, so that no
+    # gradient becomes NaN.
     vanishes = image.abs().amax(-1) < torch.finfo(image.dtype).tiny ** 0.5
     return unit * of_ball(image + vanishes.unsqueeze(-1)).masked_fill(vanishes, 0)
 
@@ -337,9 +340,9 @@ def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None)
     of range.
 
     Args:
-        offset: w, the point minus the ball's center, ``(*batch, d)``, shorter than the radius.
-        radius: r, ``(*batch,)``.
-        unit: the length that directions are given in, ``(*batch,)``; None means 1.
+        offset: points minus the ball's center, w, ``(*batch, d)``, shorter than the radius.
+        radius: radii r, ``(*batch,)``.
+        unit: length in which directions are given, ``(*batch,)``; None means 1.
     """
     size = power_of_two(torch.maximum(radius, offset.abs().amax(-1)))
     offset, radius = offset / size.unsqueeze(-1), radius / size

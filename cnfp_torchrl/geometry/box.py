@@ -20,7 +20,7 @@ from cnfp_torchrl.geometry.constraint_set import (
 from cnfp_torchrl.geometry.superlevel import Rows
 
 ACTION_RANGE = {torch.float32: (1e-7, 1e18), torch.float64: (1e-30, 1e150)}
-"""The least width and the largest number of action bounds, by dtype: flows square actions."""
+"""The least width and the largest number of action bounds, by dtype, as flows square actions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +91,8 @@ class Box(ConstraintSet):
         return type(self)(center - half, center + half, validate_args=False)
 
     def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
-        # Arithmetic, because torch.where is slow where the mask broadcasts. Where the set is active
-        # the shift is so large that the bounds stay, wherever the center is.
+        # Arithmetic, not torch.where, which is slow where the mask broadcasts. Where the set is
+        # active the shift is so large that the bounds stay, wherever the center is.
         shift = active.to(self.dtype) * (torch.finfo(self.dtype).max / 2) - radius
         shift = shift.unsqueeze(-1)
         low = torch.minimum(self.low, center + shift)
@@ -112,12 +112,12 @@ def require_action_bounds(bounds: Box, where: str = "action bounds") -> Box:
     Reads them on the host.
 
     Args:
-        bounds: the box of all actions.
-        where: the beginning of the message.
+        bounds: box of all actions.
+        where: beginning of the message.
 
     Raises:
-        GeometryError: when a bound is not finite, bounds are closer than rounding error lets a flow
-            fill, or too close or too far apart for squares in their dtype.
+        GeometryError: when a bound is not finite, or bounds are closer to each other than rounding
+            errors allow, or outside `ACTION_RANGE`.
     """
     bounds.validate_shapes(where)
     low, high = torch.broadcast_tensors(bounds.low, bounds.high)
@@ -148,8 +148,8 @@ def require_action_bounds(bounds: Box, where: str = "action bounds") -> Box:
 
 
 def sides(offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far each component goes to the high and to the low side, ``(*batch, d)``, >= 0."""
-    # Not two maxima: the gradient of each costs more than that of both parts together.
+    """Return the positive and the negative part of an offset, both ``(*batch, d)`` and >= 0."""
+    # Not two maxima, whose gradients cost more than this one and the difference.
     ahead = offset.relu()
     return ahead, ahead - offset
 
@@ -159,9 +159,9 @@ def gauge_of_sides(above: Tensor, below: Tensor, ahead: Tensor, behind: Tensor) 
 
     Args:
         above: inverse distances from the anchor to the high bounds, ``(*batch, d)``.
-        below: inverse distances to the low bounds, ``(*batch, d)``.
-        ahead: of the offset, ``(*batch, d)``.
-        behind: of the offset, ``(*batch, d)``.
+        below: inverse distances from the anchor to the low bounds, ``(*batch, d)``.
+        ahead: positive part of the offset, ``(*batch, d)``.
+        behind: negative part of the offset, ``(*batch, d)``.
     """
     return torch.addcmul(ahead * above, behind, below).amax(-1)
 

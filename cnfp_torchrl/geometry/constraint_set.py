@@ -1,4 +1,4 @@
-"""The contract of a set of allowed actions: a typed, batched value made of plain tensors."""
+"""The contract of a set of allowed actions, a batched value made of plain tensors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from torch import Tensor
 from cnfp_torchrl.geometry.superlevel import Superlevel
 
 EROSION_IN_EPS = 16.0
-"""How many units of rounding error `ConstraintSet.eroded` moves a boundary inwards."""
+"""The distance by which `ConstraintSet.eroded` moves a boundary, in units of rounding error."""
 
 Gauge: TypeAlias = Callable[[Tensor], Tensor]
-"""The gauge of a set about an anchor: directions ``(*batch, d)`` to values ``(*batch,)``."""
+"""The gauge of a set about an anchor, from directions ``(*batch, d)`` to values ``(*batch,)``."""
 
 
 def broadcast_shape(*shapes: torch.Size) -> torch.Size:
-    """Return the shape that shapes broadcast to, at once where they are equal or empty."""
+    """Return the shape that shapes broadcast to.
+
+    Faster than `torch.broadcast_shapes` where all shapes are equal or empty.
+    """
     known = [shape for shape in shapes if len(shape)]
     if all(shape == known[0] for shape in known):
         return known[0] if known else torch.Size()
@@ -32,8 +35,8 @@ def broadcast_shape(*shapes: torch.Size) -> torch.Size:
 def largest_value(dtype: torch.dtype) -> float:
     """Return the largest finite number that a field may hold: 1e33 in float32, 1e150 in float64.
 
-    Sums of many stay finite, and so do their squares in the search for anchors, which is done in
-    float64.
+    Sums of many such numbers stay finite, and so do their squares in float64, in which anchors are
+    searched for.
     """
     return 1e33 if dtype == torch.float32 else 1e150
 
@@ -51,7 +54,7 @@ class Bounds(NamedTuple):
 
 
 class GeometryError(ValueError):
-    """A set that is no set: names the constraint, the field, what was expected and given."""
+    """Invalid fields of a set; names the constraint, the field, the expected and the given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +73,16 @@ class ConstraintSet(ABC):
     and, where there is more to say than the defaults do,
 
     - `gauge_about`: the gauge with all that does not depend on the direction computed once,
-    - `inflated`: the set widened, so that a constraint that cannot be had gives way by the least
-      amount; without it, it is dropped where it cannot be had,
-    - `row_slacks`, `rounding`: where the set is made of several rows, which give way one by one,
+    - `inflated`: the set widened, by which a constraint that cannot hold is relaxed; a family
+      without it is dropped instead,
+    - `row_slacks`, `rounding`: the rows that a set is made of, which are relaxed one by one,
     - `invalid_fields`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
-    - `superlevel`: what the search for anchors needs to be fast, `part_near` if not convex.
+    - `superlevel`: a description of {slack >= t} that makes the search for anchors fast, and
+      `part_near` if the set is not convex.
 
-    Constructing a set checks it, which reads tensors on the host. Hot paths, whose values were
-    checked where they entered, construct with ``validate_args=False``.
+    Constructing a set checks it, which reads tensors on the host. Hot paths construct sets with
+    ``validate_args=False``: their values were checked where they entered.
 
     Raises:
         GeometryError: when a field has the wrong shape or dtype, contains NaN, or describes no set.
@@ -97,48 +101,53 @@ class ConstraintSet(ABC):
     def slack(self, action: Tensor) -> Tensor:
         """Return how far inside an action is: positive inside, negative outside, concave in it.
 
-        The distance to the boundary, or a lower bound of it where it has no closed form.
+        The distance to the boundary, or a lower bound of it where that has no closed form.
         """
 
     @abstractmethod
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         r"""Return the gauge about an anchor, :math:`g(v) = \inf\{t > 0 : c + v/t \in C\}`.
 
-        The boundary lies at ``anchor + direction / gauge``; 0 where the set has no end that way.
+        The boundary lies at ``anchor + direction / gauge``. In directions in which the set is
+        unbounded the gauge is 0.
 
         Args:
-            direction: ``(*batch, d)``, not zero.
-            anchor: ``(*batch, d)``, strictly inside the set; elsewhere the result is meaningless.
+            direction: vectors ``(*batch, d)``, none of them zero.
+            anchor: points strictly inside the set, ``(*batch, d)``; about others the result is
+                meaningless.
         """
 
     @abstractmethod
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        """Return the set moved inwards by a few units of rounding error, absolutely.
+        """Return the set with its boundary moved inwards by a few units of rounding error.
 
-        A point of the eroded set computed in the set's dtype, with coordinates of at most
-        `magnitude`, lies in the true set with zero tolerance.
+        A point of the eroded set, computed in the set's dtype, lies in the true set with zero
+        tolerance.
+
+        Args:
+            magnitude: largest coordinate of the points, ``(*batch,)``.
         """
 
     @abstractmethod
     def around(self, center: Tensor, radius: Tensor) -> Self:
         """Return a set of this family that contains a ball, with fields shaped as here.
 
-        It takes a dropped set's place: it reaches beyond the action bounds, so that it never binds.
+        It takes the place of a dropped set, with a ball that contains the action bounds.
 
         Args:
-            center: of the ball, ``(*batch, d)``.
-            radius: of the ball, ``(*batch,)``, positive.
+            center: center of the ball, ``(*batch, d)``.
+            radius: radius of the ball, ``(*batch,)``, positive.
         """
 
     def inflated(self, by: Tensor) -> Self:
         """Return the set widened to all actions with a slack of at least ``-by``.
 
-        Only families that override this can be relaxed; one that does not, such as a non-convex
-        one, is dropped where it cannot be had.
+        Families that do not override this, such as non-convex ones, cannot be relaxed: where they
+        cannot hold they are dropped.
 
         Args:
-            by: amounts in units of the slack, ``(*batch, m)`` for the m rows of `row_slacks` or
-                ``(*batch, 1)`` for all of them alike; finite, 0 or more.
+            by: amounts in units of the slack, finite, 0 or more: ``(*batch, m)`` for the m rows of
+                `row_slacks`, or ``(*batch, 1)`` for all rows alike.
 
         Raises:
             TypeError: when the family cannot be widened.
@@ -152,13 +161,13 @@ class ConstraintSet(ABC):
 
     @classmethod
     def has_rows(cls) -> bool:
-        """Tell whether sets of the family are made of several rows, see `row_slacks`."""
+        """Tell whether the family states `row_slacks`: its sets are made of several rows."""
         return cls.row_slacks is not ConstraintSet.row_slacks
 
     def row_slacks(self, action: Tensor) -> Tensor:
-        """Return the slacks of the rows that a set is made of, ``(*batch, m)``.
+        """Return the slacks of the m rows that the set is made of, ``(*batch, m)``.
 
-        Their least is `slack`; by default the set is one row.
+        The smallest of them is `slack`. By default the set is one row.
         """
         return self.slack(action).unsqueeze(-1)
 
@@ -167,26 +176,26 @@ class ConstraintSet(ABC):
         like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
         zero = like.new_zeros(self.dim)
         moved = self.row_slacks(zero) - self.eroded(magnitude).row_slacks(zero)
-        # Rows that let every action pass, and a set that has no slack at 0, say nothing.
+        # 0, not NaN, for rows that let every action pass and for a set without a slack at 0.
         return moved.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        """Return the gauge about an anchor, for many directions: what they share is computed once.
+        """Return the gauge about an anchor, with all that directions share computed once.
 
         Args:
-            anchor: ``(*batch, d)``, strictly inside the set.
+            anchor: points strictly inside the set, ``(*batch, d)``.
         """
         return partial(_gauge_at, self, anchor)
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
-        """Yield (field, mask of bad elements, what was expected) for each rule of the family."""
+        """Yield (field, mask of its bad elements, the expected) for each rule of the family."""
         yield from ()
 
     def contains(self, action: Tensor) -> Tensor:
         """Tell, with zero tolerance, whether each action ``(*batch, d)`` lies in its set.
 
-        The arithmetic is done in float64 whatever the dtype, so that the answer concerns the given
-        numbers and not the rounding of the test.
+        Computed in float64 whatever the dtype, so that the answer is about the given numbers, not
+        about rounding errors of the test.
         """
         return self.to(torch.float64).slack(action.double()) >= 0
 
@@ -199,19 +208,19 @@ class ConstraintSet(ABC):
     def superlevel(self) -> Superlevel | None:
         """Describe the actions with a slack of at least t, for the search for anchors.
 
-        None, the default, makes the search linearize `slack` instead: right for any concave slack,
-        but slower. A non-convex family describes a convex part of its set, and others by
+        With None, the default, the search linearizes `slack`: right for any concave slack, but
+        slower. A non-convex family describes one convex part of its set here, and others in
         `part_near`.
         """
         return None
 
     def part_near(self, point: Tensor) -> Superlevel | None:
-        """Describe a convex part with as much slack at a point as the whole set has, for a search.
+        """Describe a convex part that has as much slack at a point as the whole set has.
 
-        A convex family, which has but one part, leaves this as it is.
+        Only non-convex families override this: a convex set is its own and only part.
 
         Args:
-            point: ``(*batch, d)``.
+            point: points ``(*batch, d)``.
         """
         return self.superlevel()
 
@@ -240,9 +249,9 @@ class ConstraintSet(ABC):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """Return the set with all fields in a dtype, on a device; itself where they are already.
+        """Return the set with all fields in a dtype and on a device, itself if nothing changes.
 
-        Rounding the fields moves the boundary by less than `eroded` does.
+        Rounding of the fields moves the boundary by less than `eroded` does.
         """
         if device is None and dtype in (None, self.dtype):
             return self
@@ -277,9 +286,9 @@ class ConstraintSet(ABC):
         """Return the set where it is active, and elsewhere one of its family that contains a ball.
 
         Args:
-            active: boolean ``(*batch,)``.
-            center: of the ball, ``(*batch, d)``.
-            radius: of the ball, ``(*batch,)``.
+            active: flags of the states in which the set stays, boolean ``(*batch,)``.
+            center: center of the ball, ``(*batch, d)``.
+            radius: radius of the ball, ``(*batch,)``.
         """
         return self.where(active, self.around(center, radius))
 
@@ -287,7 +296,7 @@ class ConstraintSet(ABC):
         """Return the set itself, or refuse it.
 
         Args:
-            name: the constraint's name, for the message.
+            name: name of the constraint, for the message.
 
         Raises:
             GeometryError: naming constraint, field, batch index, the expected and the given.
@@ -305,10 +314,10 @@ class ConstraintSet(ABC):
         return self
 
     def validate_shapes(self, where: str) -> None:
-        """Refuse fields of wrong types or shapes, without a look at their values.
+        """Refuse fields of wrong types or shapes, without reading their values.
 
         Args:
-            where: what the message begins with.
+            where: beginning of the message.
 
         Raises:
             GeometryError: naming the field, the expected and the given.
@@ -359,12 +368,12 @@ class ConstraintSet(ABC):
             ) from None
 
     def shape_problem(self) -> str | None:
-        """Say what is wrong with the event shapes beyond a common dimension, if anything is."""
+        """Return what is wrong with the event shapes beyond their dimension d, None if nothing."""
         return None
 
     @classmethod
     def fields_of_other_width(cls) -> frozenset[str]:
-        """Name the fields whose last size is not the action dimension."""
+        """Return the fields whose last size is not the action dimension."""
         return frozenset()
 
     def _refuse(self, where: str, field: str, bad: Tensor, expected: str) -> None:

@@ -28,12 +28,12 @@ class HalfSpaces(ConstraintSet):
 
     It need not be bounded. A control barrier function gives one row,
     :math:`-L_g h \cdot a \le L_f h + \alpha(h)`. A row whose normal is zero lets every action pass
-    where its offset is 0 or more, and none where it is less: there it is relaxed by as much. Rows
-    are relaxed one by one, each by a distance.
+    if its offset is 0 or more, else none. Rows are relaxed one by one, each by a distance, or by an
+    offset where the normal is zero.
 
     Args:
-        normals: ``(*batch, m, d)``, finite.
-        offsets: ``(*batch, m)``; an infinite one lets every action pass.
+        normals: outward normals of the rows, ``(*batch, m, d)``, finite.
+        offsets: offsets of the rows, ``(*batch, m)``; infinite ones let every action pass.
     """
 
     normals: Tensor
@@ -89,7 +89,7 @@ class HalfSpaces(ConstraintSet):
         return partial(_gauge, rows.normals, room.reciprocal())
 
     def bounding_box(self) -> Bounds:
-        """Return the bounds that single rows with one component set; the others are infinite."""
+        """Return the bounds set by rows along an axis; the others are infinite."""
         single = (self.normals != 0).sum(-1, keepdim=True) == 1
         bound = self.offsets.unsqueeze(-1) / self.normals
         high = torch.where(single & (self.normals > 0), bound, torch.inf).amin(-2)
@@ -118,14 +118,14 @@ class HalfSpaces(ConstraintSet):
         sets = self._normalized()
         lengths = vector_norm(sets.normals, dim=-1)
         zero = lengths == 0
-        # Where a normal is zero, either every action passes or none does.
+        # A normal of zero lets every action pass or none.
         offsets = torch.where(zero & (sets.offsets >= 0), torch.inf, sets.offsets)
         return Rows(sets.normals, offsets, lengths.masked_fill(zero, 1))
 
     def _normalized(self) -> Self:
         """Return the same set with normals of about unit length, which do not vanish when squared.
 
-        An offset out of range beside its normal becomes infinite: no action is as far away.
+        An offset out of range beside its normal becomes infinite: no action reaches that row.
         """
         unit = power_of_two(self.normals.abs().amax(-1))
         return type(self)(

@@ -1,4 +1,4 @@
-"""Norms that neither overflow nor underflow where the result is a number of the dtype."""
+"""Norms that neither overflow nor underflow where the dtype can hold the result."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from torch.linalg import vector_norm
 
 
 def power_of_two(size: Tensor) -> Tensor:
-    """Return the powers of two next below sizes, and 1 for 0 and for what is no finite number.
+    """Return the largest powers of two up to the sizes, and 1 for sizes of 0, infinity and NaN.
 
-    Units to compute in: dividing by them changes the exponent alone, so that nothing is rounded. No
-    gradient passes.
+    They are units to compute in: division by them changes exponents alone, so that nothing is
+    rounded. They have no gradient.
     """
     size = size.detach()
     mantissa, _ = torch.frexp(size)
-    return (size / (2 * mantissa)).nan_to_num(1.0)
+    # 0 by itself, not by 0/0, which is NaN only where no rounding has touched the mantissa.
+    return (size / (2 * mantissa)).nan_to_num(1.0).masked_fill(size == 0, 1.0)
 
 
 def length(vector: Tensor) -> Tensor:
@@ -24,7 +25,7 @@ def length(vector: Tensor) -> Tensor:
     `torch.linalg.vector_norm` gives 0 for lengths below 1e-23 in float32, and infinity above 1e19.
 
     Args:
-        vector: ``(*batch, d)``.
+        vector: vectors ``(*batch, d)``.
     """
     unit = power_of_two(vector.abs().amax(-1))
     return unit * vector_norm(vector / unit.unsqueeze(-1), dim=-1)
@@ -36,7 +37,7 @@ def spectral_norm_bound(matrix: Tensor) -> Tensor:
     Exact where M is diagonal and where it has one row or one column.
 
     Args:
-        matrix: M, ``(*batch, m, d)``.
+        matrix: matrices M, ``(*batch, m, d)``.
     """
     if 0 in matrix.shape[-2:]:
         return matrix.new_zeros(matrix.shape[:-2])

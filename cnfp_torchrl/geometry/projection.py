@@ -23,7 +23,7 @@ def onto_box(box: Box, point: Tensor) -> Tensor:
 def onto_ball(ball: Ball, point: Tensor) -> Tensor:
     r"""Return :math:`m + (a - m)\, r / \max(|a - m|, r)`."""
     offset = point - ball.center
-    # Not min(1, r / |a - m|), whose gradient is NaN at the anchor.
+    # Not min(1, r / |a - m|), whose gradient is NaN at the center.
     reach = vector_norm(offset, dim=-1).clamp(min=ball.radius)
     return ball.center + offset * (ball.radius / reach).unsqueeze(-1)
 
@@ -41,7 +41,7 @@ def onto_half_space(half_space: HalfSpaces, point: Tensor) -> Tensor:
         )
     normal = half_space.normals.squeeze(-2)
     excess = ((normal * point).sum(-1, keepdim=True) - half_space.offsets).relu()
-    # A normal of zero is never exceeded where the constraint can hold.
+    # A normal of zero, which is never exceeded where the constraint can hold, divides by 1.
     square = normal.square().sum(-1, keepdim=True)
     return point - excess * normal / square.masked_fill(square == 0, 1)
 
@@ -51,20 +51,20 @@ PROJECTIONS: dict[type[ConstraintSet], Callable[..., Tensor]] = {
     Ball: onto_ball,
     HalfSpaces: onto_half_space,
 }
-"""Families and their closed-form projections of a point; other families may be added."""
+"""Closed-form projections of a point, by family; others may be added."""
 
 
 def project(constraint_set: ConstraintSet, point: Tensor) -> Tensor:
     r"""Return the closest point of a set, :math:`\arg\min_{a \in C} |a - p|`, in closed form.
 
     Args:
-        constraint_set: of a family in `PROJECTIONS`.
-        point: p, ``(*batch, d)``.
+        constraint_set: set of a family in `PROJECTIONS`.
+        point: points p, ``(*batch, d)``.
 
     Raises:
         TypeError: when the family has no closed-form projection.
     """
-    # A plain look-up, because torch.compile cannot trace functools.singledispatch.
+    # A plain look-up, not functools.singledispatch, which torch.compile cannot trace.
     projection = PROJECTIONS.get(type(constraint_set))
     if projection is None:
         raise TypeError(
@@ -79,16 +79,16 @@ def project(constraint_set: ConstraintSet, point: Tensor) -> Tensor:
 def onto_box_and_ball(box: Box, ball: Ball, point: Tensor) -> Tensor:
     r"""Return the closest point of the intersection of a box and a ball, which must not be empty.
 
-    By its optimality conditions it is :math:`m + w(u)`, :math:`w(u) = P_{box - m}(u (a - m))`, with
-    the largest u in [0, 1] for which :math:`|w(u)| \le r`. Each component of w moves in proportion
-    to u until it stops at a bound, so that :math:`|w(u)|^2` grows with u and has 2 d kinks: from
-    the last one inside the ball, u follows in closed form. O(d^2).
+    By the optimality conditions it is :math:`m + w(u)`, :math:`w(u) = P_{box - m}(u (a - m))`, with
+    the largest u in [0, 1] for which :math:`|w(u)| \le r`. Each component of w is proportional to
+    u until it stops at a bound, so :math:`|w(u)|^2` grows with u and has 2 d kinks. From the last
+    kink inside the ball on, u has a closed form. Takes O(d^2).
     """
     offset = point - ball.center
     low, high, size = box.low - ball.center, box.high - ball.center, offset.abs()
     radius_squared = ball.radius.square()
     with torch.no_grad():
-        # Of each component's size: where it begins and where it ceases to move.
+        # The u at which each component begins to move, and at which it ceases to.
         first = torch.where(offset >= 0, low, -high)
         last = torch.where(offset >= 0, high, -low)
         begins, ceases = (
@@ -112,21 +112,21 @@ def onto_box_and_ball(box: Box, ball: Ball, point: Tensor) -> Tensor:
 def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Tensor:
     r"""Return the closest point of the intersection of a region's active sets, or nearly so.
 
-    Boxes count as one set, for the intersection of boxes is a box. A box alone and a box with one
-    ball are exact, up to rounding. Everything else takes Dykstra's algorithm: each set in turn gets
-    the point plus its own correction, :math:`x \leftarrow P_k(x + p_k)`, and keeps what the
-    projection took away, :math:`p_k \leftarrow x + p_k - P_k(x + p_k)`; half-spaces count row by
-    row. Its error falls with the number of rounds, slowly where boundaries meet at a small angle,
-    and the result may lie outside by as much as that: a retraction towards an interior point takes
-    it in (`cnfp_torchrl.bijectors.Projection`).
+    Boxes count as one set, because the intersection of boxes is a box; half-spaces count row by
+    row. A box alone and a box with one ball are exact, up to rounding. Other intersections take
+    Dykstra's algorithm, in which each set in turn projects the point plus its own correction,
+    :math:`x \leftarrow P_k(x + p_k)`, and keeps what the projection took away,
+    :math:`p_k \leftarrow x + p_k - P_k(x + p_k)`. The error falls with the number of rounds, slowly
+    where boundaries meet at a small angle. The result may lie outside by that error; a retraction
+    towards the anchor moves it inside (`cnfp_torchrl.bijectors.Projection`).
 
     Source: Boyle and Dykstra 1986, "A method for finding projections onto the intersection of
     convex sets in Hilbert spaces".
 
     Args:
-        region: of sets with closed-form projections; its anchor is not used.
-        point: ``(*batch, d)``.
-        rounds: how often each set has its turn in Dykstra's algorithm, >= 1.
+        region: region of sets with closed-form projections; its anchor is not used.
+        point: points ``(*batch, d)``.
+        rounds: number of rounds of Dykstra's algorithm, >= 1.
 
     Raises:
         TypeError: for a set without closed-form projection.
@@ -139,7 +139,7 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
         if active is None:
             return onto_box_and_ball(box, ball, point)
         return torch.where(active, onto_box_and_ball(box, ball, point), onto_box(box, point))
-    # The box last, so that the action bounds hold where the rounds did not suffice.
+    # The box comes last, not first, so that the action bounds hold after too few rounds.
     parts = [*others, (box, None)]
     corrections = [torch.zeros_like(point)] * len(parts)
     for _ in range(rounds):
@@ -152,22 +152,22 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
 
 
 def _split(region: Region) -> tuple[Box, list[tuple[ConstraintSet, Tensor | None]]]:
-    """Return the box of all boxes, and the other sets with where they count ``(*batch, 1)``."""
+    """Return the intersection of all boxes, and the other sets with masks where they count."""
     low, high = region.bounds.low, region.bounds.high
     others: list[tuple[ConstraintSet, Tensor | None]] = []
-    for stage, each in enumerate(region.widened()[1:], 1):
+    for stage, part in enumerate(region.widened()[1:], 1):
         counts = region.counts(stage)
         active = None if counts is None else counts.unsqueeze(-1)
-        if isinstance(each, Box):
-            lower, upper = each.low, each.high
+        if isinstance(part, Box):
+            lower, upper = part.low, part.high
             if active is not None:
                 lower = torch.where(active, lower, -torch.inf)
                 upper = torch.where(active, upper, torch.inf)
             low, high = torch.maximum(low, lower), torch.minimum(high, upper)
-        elif isinstance(each, HalfSpaces):
-            for row in range(each.normals.shape[-2]):
-                normal, offset = each.normals[..., [row], :], each.offsets[..., [row]]
+        elif isinstance(part, HalfSpaces):
+            for row in range(part.normals.shape[-2]):
+                normal, offset = part.normals[..., [row], :], part.offsets[..., [row]]
                 others.append((HalfSpaces(normal, offset, validate_args=False), active))
         else:
-            others.append((each, active))
+            others.append((part, active))
     return Box(low, high, validate_args=False), others

@@ -1,4 +1,4 @@
-"""The region of allowed actions in a state: an intersection of sets, seen from one anchor."""
+"""The region of allowed actions in a state: an intersection of sets, with an anchor inside."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, b
 class Region:
     """The intersection of the action bounds with K constraint sets, widened where they are relaxed.
 
-    A set holds as stated where it is active. Elsewhere it is widened by its relaxation, row by row,
-    and adds nothing where that is infinite or unknown: there it is dropped.
+    A set holds as stated where it is active. Elsewhere it is relaxed: each of its rows is widened
+    by its relaxation. Where that is infinite or unknown it is dropped: it restricts nothing.
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        anchor: a point strictly inside all sets that are not dropped, ``(*batch, d)``.
-        active: which sets hold in which state, boolean ``(*batch, K + 1)``; None means all.
-        relaxation: by how much the rows of each set are widened, ``(*batch, m)`` a set, as
-            `lexicographic_anchor` finds it: 0 where the set is active. None means that all sets
-            that are not active are dropped.
+        anchor: points strictly inside all sets that are not dropped, ``(*batch, d)``.
+        active: flags of the sets that hold as stated, boolean ``(*batch, K + 1)``; None means all.
+        relaxation: amounts by which the m rows of each set are widened, ``(*batch, m)`` for each
+            set, 0 where it is active, as `lexicographic_anchor` finds them. None means that all
+            sets that are not active are dropped.
 
     Raises:
         GeometryError: when the first set is not a box, or dimensions or the number of relaxations
@@ -44,9 +44,9 @@ class Region:
         if not validate_args:
             return
         if not self.sets or not isinstance(self.sets[0], Box):
-            given = [type(each).__name__ for each in self.sets]
+            given = [type(constraint_set).__name__ for constraint_set in self.sets]
             raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-        dims = [each.dim for each in self.sets] + [int(self.anchor.shape[-1])]
+        dims = [*(constraint_set.dim for constraint_set in self.sets), int(self.anchor.shape[-1])]
         if len(set(dims)) > 1:
             raise GeometryError(
                 f"sets and anchor: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
@@ -68,19 +68,27 @@ class Region:
     def shape(self) -> torch.Size:
         """The shape ``(*batch, d)`` of the actions."""
         active = () if self.active is None else (self.active.shape[:-1],)
-        sets = (each.batch_shape for each in self.sets)
+        sets = (constraint_set.batch_shape for constraint_set in self.sets)
         batch = broadcast_shape(self.anchor.shape[:-1], *active, *sets)
         return torch.Size((*batch, self.anchor.shape[-1]))
+
+    @property
+    def is_active(self) -> Tensor:
+        """The flags of `active`, boolean ``(*batch, K + 1)``, all true where that is None."""
+        if self.active is not None:
+            return self.active
+        everywhere = (*self.shape[:-1], len(self.sets))
+        return torch.ones(everywhere, dtype=torch.bool, device=self.anchor.device)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
         """Return the region with sets and anchor in a dtype, all of it on a device."""
-        sets = tuple(each.to(dtype, device) for each in self.sets)
+        sets = tuple(constraint_set.to(dtype, device) for constraint_set in self.sets)
         active = None if self.active is None else self.active.to(device)
         amounts = self.relaxation
         if amounts is not None:
-            amounts = tuple(each.to(device, dtype) for each in amounts)
+            amounts = tuple(amount.to(device, dtype) for amount in amounts)
         return type(self)(sets, self.anchor.to(device, dtype), active, amounts, validate_args=False)
 
     def widened(self) -> tuple[ConstraintSet, ...]:
@@ -90,13 +98,29 @@ class Region:
         return (
             self.bounds,
             *(
-                each.inflated(amount) if each.can_be_inflated() else each
-                for each, amount in zip(self.sets[1:], self.relaxation[1:], strict=True)
+                constraint_set.inflated(amount)
+                if constraint_set.can_be_inflated()
+                else constraint_set
+                for constraint_set, amount in zip(self.sets[1:], self.relaxation[1:], strict=True)
             ),
         )
 
+    def amounts(self) -> Tensor:
+        """Return by how much each set is relaxed, ``(*batch, K + 1)``.
+
+        That of its largest row; 0 where it is active, infinite where it is dropped.
+        """
+        shape = self.shape[:-1]
+        if self.relaxation is not None:
+            largest = [each.amax(-1).expand(shape) for each in self.relaxation]
+            return torch.stack(largest, -1)
+        if self.active is None:
+            return self.anchor.new_zeros(*shape, len(self.sets))
+        dropped = self.anchor.new_full((), torch.inf)
+        return torch.where(self.active, 0.0, dropped).expand(*shape, len(self.sets))
+
     def counts(self, stage: int) -> Tensor | None:
-        """Return where a set holds or is relaxed, boolean ``(*batch,)``; None means everywhere."""
+        """Return where a set is not dropped, boolean ``(*batch,)``; None means everywhere."""
         if stage == 0 or self.active is None:
             return None
         if self.relaxation is not None and self.sets[stage].can_be_inflated():
@@ -106,8 +130,8 @@ class Region:
     def gauges(self, direction: Tensor) -> Tensor:
         """Return the gauge of the region after each stage, ``(K + 1, *batch)``.
 
-        The gauge of an intersection is the maximum of the gauges, so this is a running maximum; a
-        set that is dropped adds nothing.
+        A running maximum over the sets, because the gauge of an intersection is the maximum of the
+        gauges. A dropped set does not count.
         """
         running: list[Tensor] = []
         for gauge in self._gauges(direction):
@@ -123,15 +147,14 @@ class Region:
         return outer, inner
 
     def pulled_in(self, point: Tensor) -> Tensor:
-        """Return points ``(*batch, d)`` moved towards the anchor where they lie outside.
+        """Return the alpha projection of points ``(*batch, d)``.
 
-        They end where the ray from the anchor leaves the region; points inside stay. Of an `eroded`
-        region, so that the result lies in the region itself with zero tolerance. Known as alpha
-        projection.
+        Points outside move towards the anchor, to where the ray from it leaves the region; points
+        inside stay. To land in a region with zero tolerance, pull points into its `eroded` region.
         """
         offset = point - self.anchor
         direction, zero = scaled_direction(offset)
-        # The gauge of the offset itself; above 1 where it ends outside.
+        # The gauge of the offset, not of the scaled direction; above 1 where the point is outside.
         _, inner = self.outer_and_inner_gauge(direction)
         gauge = inner * offset.detach().abs().amax(-1)
         share = torch.where(zero, 1.0, 1 / gauge.clamp(min=1))
@@ -140,38 +163,38 @@ class Region:
     def contains(self, action: Tensor) -> Tensor:
         """Tell, with zero tolerance, whether each action lies in every set, relaxed or not."""
         inside = self.bounds.contains(action)
-        for stage, each in enumerate(self.widened()[1:], 1):
-            inside = inside & self._unless_dropped(stage, each.contains(action), True)
+        for stage, constraint_set in enumerate(self.widened()[1:], 1):
+            inside = inside & self._unless_dropped(stage, constraint_set.contains(action), True)
         return inside
 
     def slack(self, action: Tensor) -> Tensor:
         """Return the smallest slack in the sets, relaxed or not, ``(*batch,)``."""
         least = self.bounds.slack(action)
-        for stage, each in enumerate(self.widened()[1:], 1):
-            slack = self._unless_dropped(stage, each.slack(action), torch.inf)
+        for stage, constraint_set in enumerate(self.widened()[1:], 1):
+            slack = self._unless_dropped(stage, constraint_set.slack(action), torch.inf)
             least = torch.minimum(least, slack)
         return least
 
     def eroded(self) -> Self:
         """Return the region whose points, computed in its dtype, lie in this one exactly.
 
-        Relaxed sets are widened before. A dropped set is replaced by one of its family that reaches
-        beyond the action bounds, so that all sets of the result are active: nothing needs a mask,
-        and no gradient is NaN.
+        All sets of the result are active, so that nothing needs a mask and no gradient is NaN:
+        relaxed sets are widened before they are eroded, and a dropped set is replaced by one of its
+        family that reaches beyond the action bounds.
 
         Raises:
-            GeometryError: when sets and anchor have several dtypes, in the coarser ones of which
-                the erosion by the finer one's rounding error is none.
+            GeometryError: when sets and anchor differ in dtype, because erosion by the rounding
+                error of float64 vanishes in float32.
         """
-        dtypes = [each.dtype for each in self.sets]
+        dtypes = [constraint_set.dtype for constraint_set in self.sets]
         if any(dtype != self.anchor.dtype for dtype in dtypes):
             raise GeometryError(
                 f"sets and anchor: expected one dtype, given {dtypes} and {self.anchor.dtype}; "
                 "convert them with .to(dtype)"
             )
         magnitude = self.bounds.magnitude()
-        sets = [each.eroded(magnitude) for each in self.widened()]
-        # No two points of the bounds are further apart than half of it.
+        sets = [constraint_set.eroded(magnitude) for constraint_set in self.widened()]
+        # Twice the largest distance between two points of the bounds.
         beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
         for stage in range(1, len(sets)):
             counts = self.counts(stage)
@@ -198,7 +221,7 @@ class Region:
         return cls(tuple(sets), found.anchor, found.active, found.relaxation)
 
     def _gauges(self, direction: Tensor) -> list[Tensor]:
-        gauges = [each.gauge(direction, self.anchor) for each in self.widened()]
+        gauges = [s.gauge(direction, self.anchor) for s in self.widened()]
         return [self._unless_dropped(stage, gauge, 0.0) for stage, gauge in enumerate(gauges)]
 
     def _unless_dropped(self, stage: int, value: Tensor, neutral: float | bool) -> Tensor:
@@ -209,14 +232,14 @@ class Region:
 def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
     """Return an offset scaled to a largest component of one, and whether it was as good as zero.
 
-    Ratios of gauges do not depend on the length of the direction, so the scale needs no gradient;
-    in one dimension the direction is a sign and needs none either (its exact zero would come out as
-    rounding error over length). An offset of zero, which has no direction, is given one, so that
-    nothing becomes NaN; and so is one so short that gradients, which grow like 1/length, could
-    overflow when squared (1e-19 in float32, 1e-154 in float64).
+    The scale has no gradient, because ratios of gauges do not depend on it. In one dimension the
+    direction has none either: it is a sign, and its exact gradient 0 would be computed as rounding
+    error over length. An offset of zero gets an arbitrary direction, so that nothing becomes NaN;
+    so does one shorter than 1e-19 in float32 or 1e-154 in float64, where gradients, which grow
+    like 1/length, could overflow when squared.
 
     Args:
-        offset: a point minus the anchor, ``(*batch, d)``.
+        offset: points minus the anchor, ``(*batch, d)``.
 
     Returns:
         The direction ``(*batch, d)`` and the mask ``(*batch,)``.
@@ -225,6 +248,6 @@ def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
     zero = length < torch.finfo(offset.dtype).tiny ** 0.5
     if offset.shape[-1] == 1:
         offset = offset.detach()
-    # Arithmetic, because torch.where is slow where the mask broadcasts.
+    # Arithmetic, not torch.where, which is slow where the mask broadcasts.
     one = zero.to(offset.dtype)
     return (offset + one) / (length + one), zero.squeeze(-1)

@@ -1,8 +1,7 @@
-r"""Descriptions of superlevel sets :math:`\{a : slack(a) \ge t\}`, by which anchors are found.
+r"""Descriptions of superlevel sets :math:`\{a : slack(a) \ge t\}`, for the search for anchors.
 
-A convex family states one of them in `ConstraintSet.superlevel`. Newton's method
-(`cnfp_torchrl.geometry.anchor`) knows the derivatives of each kind, so a family needs none of its
-own.
+A convex family states one of them in `ConstraintSet.superlevel`. It need not state derivatives:
+Newton's method (`cnfp_torchrl.geometry.anchor`) has those of each kind.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ class Rows:
     r"""Linear rows, :math:`n_j \cdot a + \rho_j t \le b_j`.
 
     Args:
-        normals: n, ``(*batch, m, d)``.
-        offsets: b, ``(*batch, m)``; infinite ones are ignored.
-        rates: :math:`\rho \ge 0`, ``(*batch, m)``; :math:`\rho_j = |n_j|` measures slack by the
-            distance to the row's hyperplane.
+        normals: normals n, ``(*batch, m, d)``.
+        offsets: offsets b, ``(*batch, m)``; infinite ones are ignored.
+        rates: rates :math:`\rho \ge 0`, ``(*batch, m)``; with :math:`\rho_j = |n_j|` the slack is
+            the distance to the row's hyperplane.
     """
 
     normals: Tensor
@@ -33,10 +32,10 @@ class Cone:
     r"""A second-order cone, :math:`|W a + y| \le h - \rho t`.
 
     Args:
-        matrix: W, ``(*batch, k, d)``.
-        vector: y, ``(*batch, k)``.
-        size: h, ``(*batch,)``.
-        rate: :math:`\rho > 0`, ``(*batch,)``.
+        matrix: matrices W, ``(*batch, k, d)``.
+        vector: vectors y, ``(*batch, k)``.
+        size: sizes h at a slack of 0, ``(*batch,)``.
+        rate: rates :math:`\rho > 0`, ``(*batch,)``.
     """
 
     matrix: Tensor
@@ -50,10 +49,10 @@ class KinkedSum:
     r"""A sum of kinked terms, :math:`\sum_i \max(\alpha_i a_i, \beta_i a_i) \le h - \rho t`.
 
     Args:
-        upper: :math:`\alpha`, ``(*batch, d)``.
-        lower: :math:`\beta`, ``(*batch, d)``.
-        size: h, ``(*batch,)``.
-        rate: :math:`\rho \ge 0`, ``(*batch,)``.
+        upper: slopes :math:`\alpha`, ``(*batch, d)``.
+        lower: slopes :math:`\beta`, ``(*batch, d)``.
+        size: sizes h at a slack of 0, ``(*batch,)``.
+        rate: rates :math:`\rho \ge 0`, ``(*batch,)``.
     """
 
     upper: Tensor

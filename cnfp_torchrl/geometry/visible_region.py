@@ -18,19 +18,19 @@ from cnfp_torchrl.geometry.superlevel import Rows
 class VisibleRegion(ConstraintSet):
     r"""Actions whose move, from p straight to :math:`p + step\, a`, touches no closed rectangle.
 
-    Star-shaped about 0, not convex: what a rectangle R hides is its shadow
+    Star-shaped about 0, not convex: a rectangle R hides its shadow
     :math:`\{\tau a : \tau \ge 1,\ p + step\, a \in R\}`, which is convex. About another anchor c
-    the gauge is that of the part which c sees, up to where a ray first enters a shadow; it lies in
-    the true set and is star-shaped about c, so a flow into it stays sound and exact. Gauges jump
-    where rays graze a corner: the density is exact almost everywhere, a pathwise gradient leaves
-    the jumps out.
+    the gauge is that of the part seen from c, which ends where a ray first enters a shadow. That
+    part lies in the true set and is star-shaped about c, so a flow into it is safe and its density
+    exact. The gauge jumps where rays graze a corner: the density is exact almost everywhere, but a
+    pathwise gradient leaves out the jumps.
 
     Args:
-        position: p, ``(*batch, d)``, in units of length. Where it lies in a rectangle the set is
-            empty.
-        rectangles: their lowest and highest corners, ``(*batch, m, 2, d)``, in units of length.
-            Infinite bounds make walls, see `walls`.
-        step: the length that an action of one moves, ``(*batch,)``, positive and finite.
+        position: positions p, ``(*batch, d)``, in units of length. A position in a rectangle makes
+            the set empty.
+        rectangles: lowest and highest corners of m rectangles, ``(*batch, m, 2, d)``, in units of
+            length; infinite ones make walls, see `walls`.
+        step: lengths moved by an action of one, ``(*batch,)``, positive and finite.
     """
 
     position: Tensor
@@ -44,8 +44,8 @@ class VisibleRegion(ConstraintSet):
         """Return 2d infinite rectangles, ``(*batch, 2d, 2, d)``, that enclose an arena.
 
         Args:
-            low: the arena's lowest corner, ``(*batch, d)``.
-            high: its highest corner, ``(*batch, d)``.
+            low: lowest corner of the arena, ``(*batch, d)``.
+            high: highest corner of the arena, ``(*batch, d)``.
         """
         on_axis = torch.eye(low.shape[-1], dtype=torch.bool, device=low.device)
         below = torch.where(on_axis, low.unsqueeze(-2), torch.inf)
@@ -163,7 +163,7 @@ class VisibleRegion(ConstraintSet):
         return eps * (reach.unsqueeze(-1) + corners)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
-        # One wall, the radius or more beyond 0, which the center moves the position to.
+        # One wall, further from the center than the radius, and nothing but it.
         low = torch.full_like(self.rectangles[..., 0, :], -torch.inf)
         high = torch.full_like(low, torch.inf)
         wall = (center[..., :1].abs() + radius.unsqueeze(-1)).unsqueeze(-2)
@@ -229,17 +229,17 @@ class VisibleRegion(ConstraintSet):
 class VisibleOrBox(ConstraintSet):
     r"""The visible region where `in_sight` is 1, a box of actions where it is 0.
 
-    A visible region always contains the zero action or nothing. Where rounding has brought a point
-    a hair inside the margin around a rectangle, the action must lead away from it, and a box that
-    leaves out 0 can say so.
+    Where rounding has moved a position just inside the margin around a rectangle, the action must
+    lead away from it. A visible region cannot say that, because it contains the zero action or
+    nothing; a box that leaves out 0 can.
 
     Args:
-        position: see `VisibleRegion`.
-        rectangles: see `VisibleRegion`.
-        step: see `VisibleRegion`.
+        position: positions of the `VisibleRegion`, ``(*batch, d)``.
+        rectangles: corners of its rectangles, ``(*batch, m, 2, d)``.
+        step: lengths moved by an action of one, ``(*batch,)``.
         low: lower bounds of the box, ``(*batch, d)``.
         high: upper bounds of the box, ``(*batch, d)``.
-        in_sight: 1 or 0, ``(*batch,)``.
+        in_sight: choice of the visible region (1) or the box (0), ``(*batch,)``.
     """
 
     position: Tensor
@@ -285,8 +285,8 @@ class VisibleOrBox(ConstraintSet):
         return torch.where(self.sees, self.region.slack(action), self.box.slack(action))
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
-        # Each is replaced where it does not count: its gauge about an anchor outside of it may be
-        # NaN, and so would the gradient be, even where it is masked.
+        # Replaced before their gauges, not masked after: about an anchor outside of a set its gauge
+        # may be NaN, and the gradient of a masked NaN is NaN.
         one = torch.ones_like(self.in_sight)
         region = self.region.unless_dropped(self.sees, anchor, one)
         box = self.box.unless_dropped(~self.sees, anchor, one)
@@ -321,6 +321,6 @@ class VisibleOrBox(ConstraintSet):
         shape = torch.broadcast_shapes(*(offset.shape[:-1] for offset in offsets))
         return Rows(
             torch.cat([p.normals.expand(*shape, *p.normals.shape[-2:]) for p in parts], -2),
-            torch.cat([each.expand(*shape, each.shape[-1]) for each in offsets], -1),
+            torch.cat([offset.expand(*shape, offset.shape[-1]) for offset in offsets], -1),
             torch.cat([p.rates.expand(*shape, p.rates.shape[-1]) for p in parts], -1),
         )

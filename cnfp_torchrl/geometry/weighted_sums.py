@@ -25,11 +25,11 @@ from cnfp_torchrl.geometry.superlevel import KinkedSum
 class KinkedSumBound(ConstraintSet):
     r"""The set :math:`\{a : \sum_i \max(\alpha_i a_i, \beta_i a_i) \le bound\}`.
 
-    With :math:`\alpha_i \ge 0 \ge \beta_i`, which a family derives from its weights. Contains 0.
+    A family derives :math:`\alpha_i \ge 0 \ge \beta_i` from its weights. The set contains 0.
 
     Args:
-        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
+        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     weights: Tensor
@@ -40,7 +40,7 @@ class KinkedSumBound(ConstraintSet):
     @staticmethod
     @abstractmethod
     def slopes(weights: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return :math:`\alpha \ge 0` and :math:`\beta \le 0`, each ``(*batch, d)``."""
+        r"""Return :math:`\alpha \ge 0` and :math:`\beta \le 0`, both ``(*batch, d)``."""
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "weights", self.weights.isinf(), "a finite weight"
@@ -74,14 +74,14 @@ class KinkedSumBound(ConstraintSet):
         sets = self._normalized()
         side = sets._side_at_exit(direction.detach(), anchor.detach())
         room = sets.bound - (side * anchor).sum(-1)
-        # Without weights the set has no end, and a bound of 0 leaves no room to divide by.
+        # Without weights the set is unbounded, and a bound of 0 would leave 0 to divide by.
         room = room.masked_fill((sets.weights == 0).all(-1), 1)
         return ((side * direction).sum(-1) / room).clamp(min=0)
 
     def bounding_box(self) -> Bounds:
         upper, lower = self.slopes(self.weights)
         bound = self.bound.unsqueeze(-1)
-        # A slope of zero leaves its side free; abs() makes that -inf below, not inf.
+        # A slope of zero leaves its side free: abs() turns -0 into 0, whose low bound is -inf.
         return Bounds(-bound / lower.abs(), bound / upper)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
@@ -96,7 +96,7 @@ class KinkedSumBound(ConstraintSet):
     def _normalized(self) -> Self:
         """Return the same set with weights of about unit size, which do not vanish when squared.
 
-        A bound out of range beside the weights is lowered to the range: no action is as far away.
+        A bound out of range beside the weights is lowered to it: no action reaches either.
         """
         unit = power_of_two(self.weights.abs().amax(-1))
         bound = (self.bound / unit).clamp(max=largest_value(self.dtype))
@@ -137,8 +137,8 @@ class WeightedL1Ball(KinkedSumBound):
     With joint velocities as weights and torques as actions it limits the power of all joints.
 
     Args:
-        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
+        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod
@@ -146,8 +146,8 @@ class WeightedL1Ball(KinkedSumBound):
         return weights.abs(), -weights.abs()
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        # The terms of two actions in the set differ by no more than twice the bound in sum, so the
-        # rounding errors do not depend on the actions' size.
+        # In shares of the bound, not of the magnitude: terms are no larger than the bound in the
+        # set, so rounding errors do not depend on the size of the actions.
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         sets = self._normalized()
         return type(self)(sets.weights, sets.bound * (1 - 2 * eps), validate_args=False)
@@ -161,8 +161,8 @@ class PositivePart(KinkedSumBound):
     draw; power that they return does not count.
 
     Args:
-        weights: ``(*batch, d)``, finite; zeros are allowed and leave their component free.
-        bound: ``(*batch,)``, finite, 0 or more; at 0 nothing may be taken.
+        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod
@@ -170,7 +170,7 @@ class PositivePart(KinkedSumBound):
         return weights.clamp(min=0), weights.clamp(max=0)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        # Terms may be as negative as the actions allow on the way to where they become positive.
+        # With the magnitude, because terms that do not count may be as negative as actions allow.
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
         sets = self._normalized()
         size = sets.bound + sets.weights.abs().sum(-1) * magnitude

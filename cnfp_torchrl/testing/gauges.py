@@ -47,9 +47,9 @@ def check_gauge_is_homogeneous(example: Example) -> None:
             gauge = sets.gauge(rays.directions, rays.anchor)
             for scale in (_SHORTEST, 2.0**-12, 2.0**10):
                 ratio = sets.gauge(rays.directions * scale, rays.anchor) / (scale * gauge)
-                # No flow reaches exits far beyond the bounds. Near a null space, what makes a short
-                # direction leave there vanishes when squared.
-                holds = ((ratio - 1).abs() < 1e-3) | (gauge < 0.1)
+                # Exits beyond twice the ray to the bounds do not count: nearly along a null space a
+                # short direction leaves the set by a component that vanishes when squared.
+                holds = ((ratio - 1).abs() < 1e-3) | (gauge < 0.5)
                 expected = f"{scale:.3g} times the gauge for {scale:.3g} times the direction"
                 at = {"direction": rays.directions, "anchor": rays.anchor}
                 require(sets, "gauge", holds, expected, "that times", ratio, **at)

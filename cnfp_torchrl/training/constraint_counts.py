@@ -14,6 +14,7 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.keys import (
+    CONSTRAINT_STATES,
     CONSTRAINTS_KEY,
     COST_KEY,
     RESERVED_NAMES,
@@ -21,9 +22,6 @@ from cnfp_torchrl.keys import (
     relaxation_key,
 )
 from cnfp_torchrl.training.environment import counted_constraints
-
-STATES = ("active", "relaxed", "dropped")
-"""What a constraint is in a state: it holds as stated, by a wider set, or not at all."""
 
 NOT_COUNTED = "not counted"
 """What is said where nothing judges a constraint: that is not the same as no violation."""
@@ -39,8 +37,8 @@ class ConstraintCounts:
 
     Args:
         violations: number of violating steps; None where nothing judges the constraint.
-        steps: number of steps by what the constraint was in their states, see `STATES`; empty
-            where the environment does not tell.
+        steps: number of steps by what the constraint was in their states
+            (`cnfp_torchrl.keys.CONSTRAINT_STATES`); empty where the environment does not tell.
         violations_while: number of violating steps by the same; empty where either is unknown.
         largest_relaxation: largest amount by which it was relaxed, in units of its slack.
         total_relaxation: sum of the amounts over the steps in which it was relaxed.
@@ -173,8 +171,10 @@ class ConstraintTally:
         def by_state(key: str, names: Sequence[str]) -> dict[str, int]:
             if name not in names:
                 return {}
-            row = sums[key][names.index(name)] if key in sums else [0.0] * len(STATES)
-            return {state: round(count) for state, count in zip(STATES, row, strict=True)}
+            row = sums[key][names.index(name)] if key in sums else [0.0] * len(CONSTRAINT_STATES)
+            return {
+                state: round(count) for state, count in zip(CONSTRAINT_STATES, row, strict=True)
+            }
 
         def value(key: str, names: Sequence[str]) -> float:
             return sums[key][names.index(name)] if key in sums and name in names else 0.0
@@ -208,7 +208,7 @@ def gave_way_text(report: Mapping[str, Any]) -> str:
     steps: Mapping[str, int] = report["steps"]
     total, broken = sum(steps.values()), report["violations_while"]
     said = []
-    for state in STATES[1:]:
+    for state in CONSTRAINT_STATES[1:]:
         if count := steps[state]:
             amount = f" by up to {report['largest_relaxation']:.3g}" if state == "relaxed" else ""
             said.append(f"{state}{amount} in {100 * count / total:.2g} % of steps")

@@ -53,8 +53,7 @@ class Outlines:
         self._direction = region.anchor.new_zeros(dim, len(self._ray)).T
         self._direction[:, chosen] = torch.from_numpy(self._ray).to(region.anchor)
         self._region = region
-        count = len(region.sets)
-        self._holds = [True] * count if region.active is None else region.active.tolist()
+        self._holds = region.is_active.tolist()
         self._gauges: list[NDArray[np.float64] | None] = [
             each.gauge(self._direction, region.anchor).numpy() if self.holds(k) else None
             for k, each in enumerate(region.sets)

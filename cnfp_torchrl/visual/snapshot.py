@@ -106,7 +106,7 @@ class FlowSnapshot:
 
     def is_active(self, index: int) -> bool:
         """Tell whether ``region.sets[index]`` is applied in this state, as stated or relaxed."""
-        return self.region.active is None or bool(self.region.active[index])
+        return bool(self.region.is_active[index])
 
     @cached_property
     def contained(self) -> Tensor:

@@ -44,8 +44,7 @@ def telling_states(
     wide, tight = candidates
     region = head.get_region(wide)
     share, _ = openness(region)
-    if region.active is not None:
-        share = share * region.active.all(-1)
+    share = share * region.is_active.all(-1)
     permissive = wide[int(share.argmax())]
     share, edge = openness(head.get_region(tight))
     enough = edge.new_full((len(edge), 1), _VISIBLE)
@@ -71,8 +70,7 @@ def openness(region: Region) -> tuple[Tensor, Tensor]:
     gauges = torch.stack(
         torch.broadcast_tensors(*(each.gauge(ray, region.anchor) for each in region.sets))
     )
-    if region.active is not None:
-        gauges = torch.where(region.active.movedim(-1, 0).unsqueeze(1), gauges, 0.0)
+    gauges = torch.where(region.is_active.movedim(-1, 0).unsqueeze(1), gauges, 0.0)
     outer, inner = gauges[0], gauges.amax(0)
     tight = 1 + 1e-4
     binds = (gauges[1:] * tight >= inner) & (gauges[1:] > outer * tight)

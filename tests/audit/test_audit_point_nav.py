@@ -53,12 +53,12 @@ def test_the_shipped_geometry_passes(make_config: Callable[..., DictConfig]) -> 
     rows = [
         line for line in str(report).split("\n") if line.startswith(("states", *report.sources))
     ]
-    assert len(rows) == 2 * (1 + 2 * 3)
+    assert len(rows) == 3 * (1 + 2 * 3)
     assert max(map(len, rows)) <= 100
     # Uniform states lie in the rectangle, too, and with batteries below the threshold.
-    assert found(report, "uniform", "obstacle", "dropped")["count"] > 0
-    assert found(report, "uniform", "battery", "dropped")["count"] > 0
-    assert found(report, "rollouts", "together", "dropped")["count"] == 0
+    assert found(report, "uniform", "obstacle", "relaxed")["count"] > 0
+    assert found(report, "uniform", "battery", "relaxed")["count"] > 0
+    assert found(report, "rollouts", "together", "gave_way")["count"] == 0
     assert found(report, "rollouts", "obstacle", "coverage")["share"] > 0.9
     assert "no flaw found" in str(report)
 

@@ -23,9 +23,6 @@ from cnfp_torchrl.geometry import (
 
 DTYPES = (torch.float32, torch.float64)
 
-LEAST_SLACK = 5e-5
-"""Of the points about which gauges are tried, in action units."""
-
 Make = Callable[[tuple[int, ...], int], tuple[ConstraintSet, Tensor]]
 """From a batch shape and a dimension: sets some units wide, and a point well inside each."""
 
@@ -165,10 +162,10 @@ class Case:
     """A batch of sets of one family.
 
     Args:
-        name: for the test's id.
-        sets: in float64, of values that float32 holds too.
-        inside: a point well inside each, ``(*batch, d)``.
-        size: how wide the sets are, roughly, in action units.
+        name: id of the test.
+        sets: sets in float64, of numbers that float32 holds too.
+        inside: points well inside the sets, ``(*batch, d)``.
+        size: width of the sets in action units, roughly.
     """
 
     name: str
@@ -187,9 +184,6 @@ class Case:
         ones = torch.ones(self.sets.dim, dtype=self.inside.dtype)
         return Box(-reach.to(ones) * ones, reach.to(ones) * ones)
 
-    def cast(self, dtype: torch.dtype) -> ConstraintSet:
-        return self.sets.with_fields(lambda field, _: field.to(dtype))
-
     def directions(self, count: int, dtype: torch.dtype) -> Tensor:
         """Return directions of length about `size`: Gaussian, along axes, diagonal, sparse."""
         d = self.sets.dim
@@ -198,26 +192,9 @@ class Case:
         axis = torch.nn.functional.one_hot(torch.randint(d, shape[:-1]), d)
         sparse = gauss * (torch.rand(shape) < 0.2) + 1e-6 * gauss
         kinds = (gauss, axis * gauss.sign(), gauss.sign(), sparse)
-        each = torch.arange(count)
-        picked = torch.stack(kinds)[each % len(kinds), each]
+        index = torch.arange(count)
+        picked = torch.stack(kinds)[index % len(kinds), index]
         return picked.to(dtype) * self.size / picked.abs().amax(-1, keepdim=True).to(dtype)
-
-    def anchors(self, dtype: torch.dtype) -> list[Tensor]:
-        """Return anchors from the middle out to where the least slack is left, in a dtype."""
-        sets, inside = self.cast(dtype), self.inside.to(dtype)
-        bounds = self.bounds.with_fields(lambda field, _: field.to(dtype))
-        magnitude = bounds.high.amax()
-        twice = [x.eroded(magnitude).eroded(magnitude) for x in (sets, bounds)]
-        anchors = [inside]
-        for direction in self.directions(4, dtype):
-            gauge = torch.maximum(*(x.gauge(direction, inside) for x in twice))
-            chosen = inside
-            for depth in (0.3, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
-                trial = inside + direction * ((1 - depth) / gauge).unsqueeze(-1)
-                slack = torch.minimum(*(x.slack(trial) for x in twice))
-                chosen = torch.where((slack >= LEAST_SLACK).unsqueeze(-1), trial, chosen)
-            anchors.append(chosen)
-        return anchors
 
 
 def _scaled(sets: ConstraintSet, size: float) -> ConstraintSet:

@@ -15,12 +15,12 @@ from tests.geometry.cases import CASES, FAMILIES, Case
     ids=lambda case: case.name,
 )
 def test_compiled_gauge_is_the_same(case: Case) -> None:
-    way = case.directions(8, torch.float64)
+    direction = case.directions(8, torch.float64)
 
-    def gauge(way: Tensor, anchor: Tensor, fields: dict[str, Tensor]) -> Tensor:
-        return type(case.sets)(**fields, validate_args=False).eroded().gauge(way, anchor)
+    def gauge(direction: Tensor, anchor: Tensor, fields: dict[str, Tensor]) -> Tensor:
+        return type(case.sets)(**fields, validate_args=False).eroded().gauge(direction, anchor)
 
     torch.compiler.reset()
     compiled = torch.compile(gauge, fullgraph=True, backend="aot_eager", dynamic=False)
-    arguments = (way, case.inside, case.sets.fields())
+    arguments = (direction, case.inside, case.sets.fields())
     torch.testing.assert_close(compiled(*arguments), gauge(*arguments), rtol=1e-12, atol=0)

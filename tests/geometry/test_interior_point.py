@@ -92,8 +92,8 @@ def test_descriptions_agree_with_the_slack(case: Case) -> None:
     index = torch.arange(batch.numel())
     chosen = [each.select(batch, index) for each in (case.bounds, case.sets)]
     problem = program(chosen, len(index))
-    for way in case.directions(20, torch.float64):
-        action = (case.inside + 2 * way).expand(*batch, -1).reshape(len(index), -1)
+    for direction in case.directions(20, torch.float64):
+        action = (case.inside + 2 * direction).expand(*batch, -1).reshape(len(index), -1)
         expected = torch.minimum(*(each.slack(action) for each in chosen))
         given = problem.slack(action)
         if case.convex:

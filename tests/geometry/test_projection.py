@@ -41,10 +41,10 @@ class Case:
     """An intersection, and how exactly it is projected onto.
 
     Args:
-        name: for the test's id.
-        sets: the first is the box of action bounds.
-        rounds: of Dykstra's algorithm.
-        error: the largest distance to SciPy's solution, which itself is good to 2e-6.
+        name: id of the test.
+        sets: sets to intersect, the first the box of action bounds.
+        rounds: number of rounds of Dykstra's algorithm.
+        error: largest distance to SciPy's solution, which itself is good to 2e-6.
     """
 
     name: str
@@ -63,8 +63,8 @@ class Case:
 
 def random_ball(dim: int, seed: int) -> Ball:
     generator = torch.Generator().manual_seed(seed)
-    way = torch.randn(dim, generator=generator, dtype=torch.float64)
-    return Ball(1.2 * way / way.norm(), tensor(0.9).squeeze())
+    direction = torch.randn(dim, generator=generator, dtype=torch.float64)
+    return Ball(1.2 * direction / direction.norm(), tensor(0.9).squeeze())
 
 
 CASES = (

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from cnfp_torchrl.geometry import Ball, Box, Ellipsoid, TaskSpaceBall, lexicographic_anchor
-
-DTYPES = (torch.float32, torch.float64)
+from tests.geometry.cases import DTYPES
 
 
 def test_an_invertible_map_makes_an_ellipsoid() -> None:
@@ -18,9 +17,9 @@ def test_an_invertible_map_makes_an_ellipsoid() -> None:
     ball = TaskSpaceBall(inverse, offset, torch.ones(5).double())
     ellipsoid = Ellipsoid(center, tril)
     anchor = center + 0.1 * (tril @ torch.randn(5, 3, 1).double()).squeeze(-1)
-    way = torch.randn(100, 5, 3).double()
-    torch.testing.assert_close(ball.gauge(way, anchor), ellipsoid.gauge(way, anchor))
-    torch.testing.assert_close(ball.slack(anchor + way), ellipsoid.slack(anchor + way))
+    direction = torch.randn(100, 5, 3).double()
+    torch.testing.assert_close(ball.gauge(direction, anchor), ellipsoid.gauge(direction, anchor))
+    torch.testing.assert_close(ball.slack(anchor + direction), ellipsoid.slack(anchor + direction))
 
 
 def test_some_rows_of_the_identity_make_a_ball_in_these_components() -> None:
@@ -28,10 +27,12 @@ def test_some_rows_of_the_identity_make_a_ball_in_these_components() -> None:
     center, radius = torch.randn(2).double(), torch.tensor(0.7).double()
     some = TaskSpaceBall(torch.eye(4).double()[1:3], -center, radius)
     ball = Ball(center, radius)
-    way, inside = torch.randn(100, 4).double(), torch.zeros(4).double()
+    direction, inside = torch.randn(100, 4).double(), torch.zeros(4).double()
     inside[1:3] = center + 0.3
-    torch.testing.assert_close(some.gauge(way, inside), ball.gauge(way[:, 1:3], inside[1:3]))
-    torch.testing.assert_close(some.slack(way), ball.slack(way[:, 1:3]))
+    torch.testing.assert_close(
+        some.gauge(direction, inside), ball.gauge(direction[:, 1:3], inside[1:3])
+    )
+    torch.testing.assert_close(some.slack(direction), ball.slack(direction[:, 1:3]))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -41,12 +42,12 @@ def test_directions_of_the_null_space_have_no_end_and_no_gradient(dtype: torch.d
         jacobian, torch.tensor([0.1, 0.2], dtype=dtype), torch.ones((), dtype=dtype)
     )
     for length in (1e-15, 1.0, 1e6):
-        way = torch.tensor([0.0, length, 0.0], dtype=dtype, requires_grad=True)
-        gauge = ball.gauge(way, torch.zeros(3, dtype=dtype))
+        direction = torch.tensor([0.0, length, 0.0], dtype=dtype, requires_grad=True)
+        gauge = ball.gauge(direction, torch.zeros(3, dtype=dtype))
         gauge.backward()
         assert gauge == 0
-        assert way.grad is not None
-        assert (way.grad == 0).all()
+        assert direction.grad is not None
+        assert (direction.grad == 0).all()
 
 
 @pytest.mark.parametrize(("offset", "holds"), [(0.5, True), (1.5, False)])
@@ -69,7 +70,7 @@ def test_the_unit_of_the_image_does_not_matter(unit: float) -> None:
     jacobian, offset = torch.tensor([[1.0, 0.5]]), torch.tensor([0.1])
     here = TaskSpaceBall(jacobian, offset, torch.tensor(0.2))
     there = TaskSpaceBall(unit * jacobian, unit * offset, torch.tensor(0.2 * unit))
-    way = torch.randn(100, 2)
+    direction = torch.randn(100, 2)
     for anchor in (torch.zeros(2), torch.tensor([0.05, -0.1])):
-        torch.testing.assert_close(there.gauge(way, anchor), here.gauge(way, anchor))
-        torch.testing.assert_close(there.slack(anchor + way), here.slack(anchor + way))
+        torch.testing.assert_close(there.gauge(direction, anchor), here.gauge(direction, anchor))
+        torch.testing.assert_close(there.slack(anchor + direction), here.slack(anchor + direction))

@@ -89,12 +89,7 @@ def lexicographic_anchor(
     if len(left):
         margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
         searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.upper)
-        # Beside sets 1e15 times further away than the bounds are wide, the search's own rounding
-        # may have left the bounds; those sets are relaxed by so much that nothing else changes.
-        above, below = depths[0].chunk(2, -1)
-        limits = sets[0].bounding_box()
-        point = searched.anchor.clamp(limits.low + below, limits.high - above)
-        anchor = anchor.index_copy(0, left, point.to(anchor))
+        anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active)
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
         up = 1 + 4 * torch.finfo(anchor.dtype).eps

@@ -140,7 +140,7 @@ class Search:
             self._fit(self.counts)
             return
         found = refined_attempt(*self._widened(1))
-        self.kept = found.anchor
+        self._move_to(found)
         left = (~found.decided).nonzero().squeeze(-1)
         if len(left):
             some = Search(self.everything.select(left), self.depth[left], self.leeway[left])
@@ -151,7 +151,17 @@ class Search:
     def _step_inwards(self, k: int) -> None:
         """Move away from the boundaries of set k and those before it, for a better start."""
         if not self._has_odd_sets():
-            self.kept = further_attempt(*self._widened(k), steps=3).anchor
+            self._move_to(further_attempt(*self._widened(k), steps=3))
+
+    def _move_to(self, found: Attempt) -> None:
+        """Move to where an attempt led, unless that is outside of the bounds or nearly so.
+
+        Beside sets 1e15 times further away than the bounds are wide an attempt knows no better:
+        rounding errors of their slacks are as large as the bounds.
+        """
+        bounds, depth = self.everything.bounds, self.depth[:, self.everything.rows_of(0)]
+        inside = found.decided | (bounds.row_slacks(found.anchor) >= depth).all(-1)
+        self.kept = torch.where(inside.unsqueeze(-1), found.anchor, self.kept)
 
     def _has_odd_sets(self) -> bool:
         """Tell whether steps inwards do not see all that counts."""

@@ -15,7 +15,7 @@ from cnfp_torchrl.tasks.point_nav.indicators import (
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 
 Collision = Literal["pass", "block"]
-"""The effect of a collision: only counted (``pass``), or the agent also stays put (``block``)."""
+"""The effect of a collision: it is counted (``pass``), or also stops the agent (``block``)."""
 
 CONSTRAINT_NAMES = ("obstacle", "battery")
 """The names of the columns of `Transition.cost`."""

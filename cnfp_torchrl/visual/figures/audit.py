@@ -32,7 +32,7 @@ _MARKS: dict[str, dict[str, Any]] = {
     "violates, outside the set": {"marker": "x", "color": "#9A9A9A", "markersize": 4, "mew": 0.8},
     "allowed, left out": {"marker": ".", "color": "#8FCFBB", "markersize": 7, "mew": 0},
     "allowed, in the set": {"marker": ".", "color": "#1F6B58", "markersize": 6, "mew": 0},
-    "leads to where it is dropped": {"marker": "s", "color": "#E69F00", "markersize": 4, "mew": 0},
+    "leads to where it gives way": {"marker": "s", "color": "#E69F00", "markersize": 4, "mew": 0},
     "violates, in the set": {"marker": "X", "color": _FLAW, "markersize": 6, "mew": 0},
 }
 
@@ -79,7 +79,7 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[s
     titles = (
         "unsound\n% of actions in the set",
         "coverage\n% of what the indicators allow",
-        "dropped\n% of states",
+        "relaxed or dropped\n% of states",
         "tightness\n% of the action bounds left open",
     )
     for axes, title in zip(panels, titles, strict=True):
@@ -109,7 +109,7 @@ def _draw_findings(
     *,
     faint: bool,
 ) -> None:
-    shares = (found.unsound, found.coverage, found.dropped)
+    shares = (found.unsound, found.coverage, found.gave_way)
     for axes, share in zip(panels, shares, strict=False):
         _draw_share(axes, share, at, height, color, faint=faint, told=axes is panels[0])
     _draw_spread(panels[3], found.volume, at, height, color, faint=faint)
@@ -164,11 +164,11 @@ def _draw_scene(
     low, high = scene.region.bounds.low.tolist(), scene.region.bounds.high.tolist()
     pad = [0.06 * (b - a) for a, b in zip(low, high, strict=True)]
     view = (low[0] - pad[0], high[0] + pad[0], low[1] - pad[1], high[1] + pad[1])
+    active = scene.region.is_active.tolist()
     for k, name in enumerate(order, start=1):
-        active = scene.region.active is None or bool(scene.region.active[k])
         for line in set_outline(scene.region.sets[k], view):
             width = 2.4 if name == scene.name else 1.3
-            dashes = "-" if active else (0, (1.2, 1.8))
+            dashes = "-" if active[k] else (0, (1.2, 1.8))
             axes.plot(*line.T, color=colors[name], linewidth=width, linestyle=dashes, zorder=5)
     edge = region_outline(scene.region, range(len(scene.region.sets)))
     axes.plot(*edge.T, color=INK, linewidth=1.0, zorder=6)
