@@ -41,17 +41,17 @@ def constrain_env(
         )
     if not geometries:
         raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
-    for each in geometries:
-        if not isinstance(each, GeometryTransform):
+    for geometry in geometries:
+        if not isinstance(geometry, GeometryTransform):
             raise TypeError(
-                f"geometries: expected each to be a GeometryTransform, given {_kind(each)}; "
+                f"geometries: expected each to be a GeometryTransform, given {_kind(geometry)}; "
                 f"{_EXAMPLE}"
             )
-    known = any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
-    before = constraint_bijectors(env) if known else []
+    publishes = any(isinstance(t, ConstraintPublisher) for t in appended_transforms(env))
+    before = constraint_bijectors(env) if publishes else []
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
     _ = published.observation_spec  # calls each geometry for its first set
-    bijectors = [*before, *(own for each in geometries for own in each.bijectors)]
+    bijectors = [*before, *(own for geometry in geometries for own in geometry.bijectors)]
     return published.append_transform(ConstraintAnchor(bijectors, order))
 
 

@@ -188,7 +188,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if not self.flow.is_safe:
             return self.flow(bounds, sets)
         anchor = self._anchor(tensordict).to(self.action_dtype)
-        relaxation = tuple(each.to(self.action_dtype) for each in self._relaxation(tensordict))
+        relaxation = tuple(amount.to(self.action_dtype) for amount in self._relaxation(tensordict))
         return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:

@@ -141,12 +141,10 @@ class SquashFlow(Flow):
     ) -> Bijector:
         if not sets:
             return paper_squash(bounds)
-        return SquashChain(
-            [
-                paper_squash(each.inner_ball(self.max_radius) if isinstance(each, Ball) else each)
-                for each in sets
-            ]
-        )
+        return SquashChain([paper_squash(self._limited(allowed)) for allowed in sets])
+
+    def _limited(self, allowed: ConstraintSet) -> ConstraintSet:
+        return allowed.inner_ball(self.max_radius) if isinstance(allowed, Ball) else allowed
 
 
 class ProjectionFlow(RegionFlow):
