@@ -15,6 +15,7 @@ with needs_extra("train"):
     from omegaconf import DictConfig
 
     from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
+    from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory, require_settings
     from cnfp_torchrl.training.agent import application_order, build_environment, load_actor
     from cnfp_torchrl.training.run_folder import RunFolder
@@ -46,15 +47,16 @@ def audit_configured(config: DictConfig) -> AuditReport:
 @hydra.main(config_path=str(config_directory()), config_name="audit", version_base="1.3")
 def main(config: DictConfig) -> None:
     """Audit, print tables, write ``audit.json`` and ``audit.png``; exit with 3 for a flaw."""
-    report = audit_configured(config)
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    write_json(directory / "audit.json", report.as_dict())
-    draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
-    if draw is not None:
-        draw(report, directory / "audit.png")
-    sys.stdout.write(f"{report}\n{directory}\n")
-    if report.flaws:
-        sys.exit(FLAWS_FOUND)
+    with told_in_a_sentence():
+        report = audit_configured(config)
+        directory = Path(HydraConfig.get().runtime.output_dir)
+        write_json(directory / "audit.json", report.as_dict())
+        draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
+        if draw is not None:
+            draw(report, directory / "audit.png")
+        sys.stdout.write(f"{report}\n{directory}\n")
+        if report.flaws:
+            sys.exit(FLAWS_FOUND)
 
 
 if __name__ == "__main__":

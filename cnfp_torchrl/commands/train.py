@@ -14,6 +14,7 @@ with needs_extra("train"):
     from hydra.utils import instantiate
     from omegaconf import DictConfig, OmegaConf
 
+    from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.run_folder import RunFolder
@@ -53,13 +54,14 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
 def main(config: DictConfig) -> float | None:
     """Train, draw the run's figures, print the summary, and return the score for sweeps."""
-    folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
-    _save_hydra_files(folder, config)
-    summary = train(config, folder)
-    if config.figures:
-        instantiate(config.figures)(folder)
-    sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
-    return summary["score"]
+    with told_in_a_sentence():
+        folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
+        _save_hydra_files(folder, config)
+        summary = train(config, folder)
+        if config.figures:
+            instantiate(config.figures)(folder)
+        sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
+        return summary["score"]
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ class ConstraintTally:
             warnings.warn(
                 f"constraints {missed}: expected a judge of the same name in the environment, but "
                 f"{given}: their violations are {NOT_COUNTED}; append ConstraintCost({{NAME: "
-                "indicator}}), or give geometry and judge one name",
+                "indicator}), or give geometry and judge one name",
                 UncountedConstraintWarning,
                 stacklevel=2,
             )
