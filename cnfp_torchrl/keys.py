@@ -1,4 +1,4 @@
-"""Keys of the tensordict, and how to ask for an entry that may be missing.
+"""The keys of the tensordict, and a look-up that explains a missing entry.
 
 The tree of one step, for an environment of `constrain_env` with batch shape ``*batch``, K
 constraints and actions of d components::
@@ -30,7 +30,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 CONSTRAINTS_KEY = "constraints"
-"""Where geometry stands: ``("constraints", NAME, FIELD)``."""
+"""The first part of the keys of geometry, ``("constraints", NAME, FIELD)``."""
 
 ANCHOR_KEY = (CONSTRAINTS_KEY, "anchor")
 """The point strictly inside all active sets that gauges are taken about, ``(*batch, d)``."""
@@ -39,7 +39,7 @@ SAFE_ACTION_KEY = (CONSTRAINTS_KEY, "safe_action")
 """A candidate for the anchor: an action that a geometry believes to be safe, ``(*batch, d)``."""
 
 RESERVED_NAMES = (ANCHOR_KEY[-1], SAFE_ACTION_KEY[-1])
-"""What stands beside the constraints, and therefore names none of them."""
+"""The entries beside the constraints, after which no constraint may be named."""
 
 CONSTRAINT_STATES = ("active", "relaxed", "dropped")
 """What a constraint is in a state: it holds as stated, by a wider set, or not at all."""
@@ -59,26 +59,26 @@ EPISODE_COST_KEY = "episode_cost"
 
 REWARD_KEY = "reward"
 RAW_REWARD_KEY = "raw_reward"
-"""Where `cnfp_torchrl.envs.RewardPenalty` keeps the environment's own reward."""
+"""The environment's own reward, kept by `cnfp_torchrl.envs.RewardPenalty`."""
 
 
 def field_key(constraint: str, field: str) -> tuple[str, str, str]:
-    """Return where a field of a constraint's set stands."""
+    """Return the key of a field of a constraint's set."""
     return (CONSTRAINTS_KEY, constraint, field)
 
 
 def active_key(constraint: str) -> tuple[str, str, str]:
-    """Return where it stands whether a constraint's set holds in a state."""
+    """Return the key of the flag that says whether a constraint's set holds in a state."""
     return field_key(constraint, "active")
 
 
 def relaxation_key(constraint: str) -> tuple[str, str, str]:
-    """Return where it stands by how much a constraint's set had to be widened, ``(*batch,)``."""
+    """Return the key of the amount by which a constraint's set was widened, ``(*batch,)``."""
     return field_key(constraint, "relaxation")
 
 
 def row_relaxation_key(constraint: str) -> tuple[str, str, str]:
-    """Return where it stands by how much each row of a set was widened, ``(*batch, m)``."""
+    """Return the key of the amounts by which the rows of a set were widened, ``(*batch, m)``."""
     return field_key(constraint, "row_relaxation")
 
 
@@ -91,7 +91,7 @@ class MissingGeometryError(KeyError):
 
 
 def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
-    """Return an entry of a tensordict, or say how to get it there.
+    """Return an entry of a tensordict, or raise an error that says how to get it.
 
     Args:
         tensordict: The tensordict to read.
@@ -109,7 +109,7 @@ def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
 
 
 def refuse_string(argument: str, given: object) -> None:
-    """Refuse a string where a sequence of keys or names is expected: it would be split in letters.
+    """Refuse a string instead of a sequence of keys or names: it would be split into letters.
 
     Args:
         argument: The argument's name, for the message.

@@ -7,7 +7,7 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
     """Return rows as lines of text with aligned columns.
 
     Args:
-        rows: the cells, as many in each row; the first row is the header.
+        rows: The cells, as many in each row; the first row is the header.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)) for row in rows]

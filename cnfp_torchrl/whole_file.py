@@ -13,14 +13,14 @@ from typing import Any, BinaryIO
 
 @contextmanager
 def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
-    """Open a file that takes its name once everything is on the disk.
+    """Open a file that takes its name only once everything is on the disk.
 
-    It is written under another name in the same folder. An error, a full disk and a power cut leave
-    what had the name before, or nothing.
+    It is written under another name in the same folder. After an error, a full disk or a power cut,
+    the file that had the name before is still there, or none.
 
     Args:
-        path: the file's final name.
-        exclusive: never replace another file, whoever made it in the meantime.
+        path: The file's final name.
+        exclusive: Whether to refuse to replace another file, even one made in the meantime.
 
     Raises:
         FileExistsError: when exclusive and there is a file of this name.
@@ -44,7 +44,7 @@ def write_json(path: Path, document: Any) -> None:
     """Write plain values as JSON, whole or not at all.
 
     Raises:
-        ValueError: for infinity and NaN, which JSON has not.
+        ValueError: for infinity and NaN, which JSON cannot express.
     """
     with whole_file(path) as file:
         file.write(f"{json.dumps(document, indent=2, allow_nan=False)}\n".encode())

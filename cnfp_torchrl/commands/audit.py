@@ -1,4 +1,4 @@
-"""Hold constraint sets against the environment's own indicators: the command ``cnfp-audit``."""
+"""Compare constraint sets with the environment's own indicators: the command ``cnfp-audit``."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ def audit_configured(config: DictConfig) -> AuditReport:
     """Return the audit of a configuration composed from ``conf/audit.yaml``."""
     require_settings(config)
     settings: AuditSettings = instantiate(config.audit)
-    chosen, folder = config, None
+    audited, folder = config, None
     if config.run is not None:
         folder = RunFolder.open(config.run)
-        chosen = folder.load_config(tuple(config.trusted))
-    env = build_environment(chosen, batch_size=[config.batch], with_anchor=True)
+        audited = folder.load_config(tuple(config.trusted))
+    env = build_environment(audited, batch_size=[config.batch], with_anchor=True)
     return audit(
         env,
-        order=application_order(chosen),
-        flow=instantiate(chosen.flow),
-        actor=None if folder is None else load_actor(folder, chosen, env),
-        state_setter=instantiate(chosen.env.get("state_setter")),
+        order=application_order(audited),
+        flow=instantiate(audited.flow),
+        actor=None if folder is None else load_actor(folder, audited, env),
+        state_setter=instantiate(audited.env.get("state_setter")),
         settings=settings,
     )
 

@@ -1,4 +1,4 @@
-"""Evaluate a trained run beside policies that learn nothing: the command ``cnfp-evaluate``."""
+"""Evaluate a trained run and baselines that learn nothing: the command ``cnfp-evaluate``."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def _gave_way(reports: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield a line for each constraint that gave way under a policy."""
     for policy, report in reports.items():
         for name, counts in report["constraints"].items():
-            if said := gave_way_text(counts):
-                yield f"{policy}: {name} {said}"
+            if text := gave_way_text(counts):
+                yield f"{policy}: {name} {text}"
 
 
 @hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
@@ -58,11 +58,11 @@ def main(config: DictConfig) -> None:
         trusted = tuple(config.trusted)
         folder = RunFolder.open(config.run)
         directory = Path(HydraConfig.get().runtime.output_dir)
-        shown: AbstractContextManager[Any] = nullcontext()
+        stream: AbstractContextManager[Any] = nullcontext()
         if visual is not None:
             recording = directory / RECORDING
-            shown = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
-        with shown:
+            stream = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
+        with stream:
             reports = evaluate_run(folder, settings, trusted=trusted)
             output = directory / "evaluation.json"
             write_json(

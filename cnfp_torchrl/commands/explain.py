@@ -13,6 +13,7 @@ with needs_extra("train"):
     from tensordict import TensorDictBase
 
     from cnfp_torchrl.envs import find_task_view
+    from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
     from cnfp_torchrl.modules import flow_head
     from cnfp_torchrl.training.agent import build_environment, load_actor
     from cnfp_torchrl.training.callbacks import replay_episodes
@@ -40,16 +41,16 @@ def explain_run(
     The episode is that of ``cnfp-evaluate`` with the same number of episodes and the same seed.
 
     Args:
-        folder: a finished run.
-        step: of the episode, from 0.
-        episode: of the evaluation, from 0.
-        episodes: of the whole evaluation; None takes the run's.
-        seed: of the evaluation; None takes the run's.
-        deterministic: explain the deterministic policy and not the stochastic one.
-        trusted: see `RunFolder.load_config`.
+        folder: The folder of a finished run.
+        step: The step's number in the episode, from 0.
+        episode: The episode's number in the evaluation, from 0.
+        episodes: The number of episodes of the evaluation; None takes the run's.
+        seed: The seed of the evaluation; None takes the run's.
+        deterministic: Whether the policy acts deterministically.
+        trusted: The packages that the run's configuration may name, see `RunFolder.load_config`.
 
     Raises:
-        ValueError: for a step or an episode that there is not, and for a flow without stages.
+        ValueError: for a step or an episode that does not exist, and for a flow without stages.
     """
     config = folder.load_config(trusted)
     settings = EvaluationSettings(
@@ -117,12 +118,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _outcome(transition: TensorDictBase, names: Sequence[str]) -> str:
-    after = transition.get("next")
-    outcome = f"Reward {float(after.get('reward').sum()):.3f}"
+    outcome = transition.get("next")
+    reward = f"Reward {float(outcome.get(REWARD_KEY).sum()):.3f}"
     if not names:
-        return f"{outcome}."
-    broken = [name for name, cost in zip(names, after.get("cost").tolist(), strict=True) if cost]
-    return f"{outcome}; the environment counted {' and '.join(broken) or 'no'} violations."
+        return f"{reward}."
+    costs = outcome.get(COST_KEY).tolist()
+    broken = [name for name, cost in zip(names, costs, strict=True) if cost]
+    return f"{reward}; the environment counted {' and '.join(broken) or 'no'} violations."
 
 
 if __name__ == "__main__":

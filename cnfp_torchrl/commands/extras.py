@@ -1,4 +1,4 @@
-"""What a command says when the packages it needs are not installed."""
+"""The error of a command whose packages are not installed."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def needs_extra(name: str) -> Iterator[None]:
-    """Import packages of an extra, or end the command with a sentence that says what to install.
+    """End the command with the extra to install when an import in this context fails.
 
     Args:
-        name: the extra of this package that brings them.
+        name: The extra of this package that brings the imported packages.
     """
     try:
         yield

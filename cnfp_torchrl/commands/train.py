@@ -1,4 +1,4 @@
-"""Train a policy that cannot break its constraints: the command ``cnfp-train``."""
+"""Train a policy on a constrained environment: the command ``cnfp-train``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ with needs_extra("train"):
 
 
 def _save_hydra_files(folder: RunFolder, config: DictConfig) -> None:
-    """Write what Hydra would, who would write it over that of a run whose folder it is."""
+    """Write Hydra's own files, which Hydra would write over those of a run that has the folder."""
     hydra_config = HydraConfig.get()
     contents = {
         "config": config,
@@ -37,8 +37,8 @@ def _save_hydra_files(folder: RunFolder, config: DictConfig) -> None:
             file.write(OmegaConf.to_yaml(content).encode())
 
 
-def _told(summary: Mapping[str, Any]) -> str:
-    """Return the results in a line, and one for each constraint that gave way or was broken."""
+def _summary_text(summary: Mapping[str, Any]) -> str:
+    """Return a line of results, and one for each constraint that gave way or was broken."""
     counts = ", ".join(f"{name} {count_text(n)}" for name, n in summary["violations"].items())
     score = "" if summary["score"] is None else f", score {summary['score']:.3f}"
     lines = [
@@ -46,8 +46,8 @@ def _told(summary: Mapping[str, Any]) -> str:
         f"{summary['steps']} steps in {summary['seconds']:.0f} s"
     ]
     for name, report in summary["constraints"].items():
-        if said := gave_way_text(report):
-            lines.append(f"{name} {said}")
+        if text := gave_way_text(report):
+            lines.append(f"{name} {text}")
     return "\n".join(lines)
 
 
@@ -60,7 +60,7 @@ def main(config: DictConfig) -> float | None:
         summary = train(config, folder)
         if config.figures:
             instantiate(config.figures)(folder)
-        sys.stdout.write(f"{_told(summary)}\n{folder.path}\n")
+        sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
         return summary["score"]
 
 

@@ -24,22 +24,23 @@ with needs_extra("rerun"):
 _FOLDERS = ("outputs", "multirun")
 
 
-def newest_recording(places: Sequence[str | Path]) -> Path:
+def newest_recording(paths: Sequence[str | Path]) -> Path:
     """Return the recording that was written last.
 
     Args:
-        places: recordings, or folders to look through.
+        paths: Recordings, or folders to search.
 
     Raises:
         FileNotFoundError: when there is none.
     """
     found: list[Path] = []
-    for place in map(Path, places):
-        found += [place] if place.is_file() else place.rglob("*.rrd")
+    for path in map(Path, paths):
+        found += [path] if path.is_file() else path.rglob("*.rrd")
     if not found:
-        looked = ", ".join(str(place) for place in places)
+        searched = ", ".join(map(str, paths))
         raise FileNotFoundError(
-            f"expected a recording, found none in {looked}; record one with: cnfp-train visual=file"
+            f"expected a recording, found none in {searched}; record one with: "
+            "cnfp-train visual=file"
         )
     return max(found, key=lambda path: path.stat().st_mtime)
 
@@ -56,17 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="folder of a run, or a recording; the newest of several (default: of all runs here)",
     )
     parser.add_argument("--follow", action="store_true", help="show what a run still records, too")
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--web", action="store_true", help="serve it to a browser instead")
-    where.add_argument("--connect", metavar="URL", help="show it in a viewer that runs already")
+    target = parser.add_mutually_exclusive_group()
+    target.add_argument("--web", action="store_true", help="serve it to a browser instead")
+    target.add_argument("--connect", metavar="URL", help="show it in a viewer that runs already")
     parser.add_argument("--memory-limit", default="2GiB", help="of the viewer (%(default)s)")
     given = parser.parse_args(arguments)
     try:
         path = newest_recording(given.run)
         viewer = _viewer(given)
         viewer.require()
-        told = f", open {viewer.url} and end with Ctrl-C" if isinstance(viewer, WebViewer) else ""
-        sys.stdout.write(f"{path}{told}\n")
+        advice = f", open {viewer.url} and end with Ctrl-C" if isinstance(viewer, WebViewer) else ""
+        sys.stdout.write(f"{path}{advice}\n")
         sys.stdout.flush()
         status = _follow(path, viewer) if given.follow else _open(path, viewer)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Configurations: where the shipped ones are, what settings may be, what a run's may name."""
+"""Configurations: where the shipped ones are, what settings may be, what a run's may call."""
 
 from cnfp_torchrl.configuration.directory import config_directory
 from cnfp_torchrl.configuration.settings import require_fields, require_setting, require_settings

@@ -9,7 +9,7 @@ def config_directory(package: Path = _PACKAGE) -> Path:
     """Return the folder of the Hydra configs: the wheel's own copy, else the checkout's ``conf/``.
 
     Args:
-        package: the folder of the installed package.
+        package: The folder of the installed package.
 
     Raises:
         FileNotFoundError: when there is neither.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-if TYPE_CHECKING:  # it has no home at run time
+if TYPE_CHECKING:  # a module of type stubs, which cannot be imported
     from _typeshed import DataclassInstance
 
 
@@ -18,8 +18,8 @@ class Expected(NamedTuple):
     """A kind of value that a setting may have.
 
     Args:
-        description: the words that complete "expected ...".
-        accepts: the test of a value.
+        description: The end of the sentence "expected ...".
+        accepts: The test of a value.
     """
 
     description: str
@@ -109,15 +109,15 @@ EXPECTED = {
     "visual.viewer.port": _or_null(PORT),
     "visual.viewer.web_port": PORT,
 }
-"""What each setting has to be, by its name in a configuration."""
+"""The kind of value of each setting, by its dotted name in a configuration."""
 
 
 def require_setting(name: str, given: object) -> None:
     """Refuse a value that a setting of the table may not have.
 
     Args:
-        name: the setting's name, as in `EXPECTED`.
-        given: the setting's value.
+        name: The setting's name, as in `EXPECTED`.
+        given: The setting's value.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -131,8 +131,8 @@ def require_fields(section: str, given: DataclassInstance) -> None:
     """Refuse a dataclass with a field that the setting of its name may not have.
 
     Args:
-        section: the part of a configuration that describes the dataclass, such as ``training``.
-        given: the dataclass; every field stands in the table.
+        section: The section of a configuration that describes the dataclass, such as ``training``.
+        given: The dataclass; every field is in the table.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -142,7 +142,7 @@ def require_fields(section: str, given: DataclassInstance) -> None:
 
 
 def require_settings(config: DictConfig) -> None:
-    """Refuse a configuration with a setting that would make it fail later, or do nonsense.
+    """Refuse a configuration with a setting of the wrong kind, before any work starts.
 
     Settings that it does not have are passed over: other collectors, losses and optimizers have
     others.

@@ -1,9 +1,9 @@
-"""What a run's configuration may name, decided before anything that it names is called.
+"""The check of a run's configuration, before anything that it names is called.
 
 A configuration is a program: ``_target_`` names what is called, the keys beside it are the
-arguments. That of a stranger's run is plain data (`read_plain`) until every target and argument in
-it has been looked at (`require_trusted`). A target is accepted for what it is and not for how its
-name begins, because a dotted name leads out of a package through any module that it imports.
+arguments. A stranger's is read as plain data (`read_plain`), and refused unless every target and
+argument in it may be used (`require_trusted`). A target is accepted for what it is, not for how its
+name begins: a dotted name leads out of a package through any module that it imports.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BUILT = ("env", "flow", "network", "evaluation")
 """The sections of a run's configuration that are built again when the run is read."""
 
 FOREIGN = ("torchrl.envs.GymEnv",)
-"""What a configuration may name beside this package: nothing that reads a file or runs code."""
+"""The targets outside this package; none of them reads a file or runs code."""
 
 _PACKAGE = __name__.partition(".")[0]
 
@@ -40,11 +40,11 @@ _SPECIAL = {
         lambda x: x in ("none", "partial", "object", "all"),
     ),
 }
-"""Hydra's keys beside ``_target_``, and what they may be."""
+"""Hydra's keys beside ``_target_``: the description of their values, and its test."""
 
-# No dots but in numbers, and no separators: the name of neither a file nor a module's attribute.
+# Dots only in numbers, and no separators, so that it names no file and no module's attribute.
 _WORDS = ("words without slashes, colons and dots", re.compile(r"(?:[\w -]|(?<=\d)\.(?=\d))*"))
-# A colon would name a module to import.
+# No colon, before which Gymnasium takes the name of a module to import.
 _ENVIRONMENT = ("a registered name without a module", re.compile(r"(?:[\w-]+/)?[\w.-]+"))
 _TEXTS = {
     "_args_": _ENVIRONMENT,
@@ -52,7 +52,7 @@ _TEXTS = {
     "backend": ("gym or gymnasium", re.compile("gym|gymnasium")),
     "device": ("a device such as cuda:0", re.compile(r"\w+(?::\d+)?")),
 }
-"""What a text may be as an argument of this name; any other has to be `_WORDS`."""
+"""The pattern of a string by the name of the argument; of any other argument it is `_WORDS`."""
 
 
 class DetourError(ValueError):
@@ -60,10 +60,10 @@ class DetourError(ValueError):
 
 
 def read_plain(path: Path) -> dict[str, Any]:
-    """Return the content of a YAML file as plain data: nothing is resolved, made or imported.
+    """Return the content of a YAML file as plain data; nothing is resolved, built or imported.
 
     Raises:
-        ValueError: when it is no YAML, has a tag or an alias, or is no mapping.
+        ValueError: when it is not YAML, has a tag or an alias, or is not a mapping.
     """
     expected = f"{path}: expected the plain YAML mapping that a training run writes"
     remedy = "copy the file anew from where the run was trained"
@@ -79,7 +79,7 @@ def read_plain(path: Path) -> dict[str, Any]:
 
 
 def _tags_and_aliases(text: str) -> Iterator[str]:
-    """Yield what makes YAML more than data: tags name types, and aliases multiply."""
+    """Yield tags, which name types, and aliases, which multiply, with their lines."""
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         tag = getattr(event, "tag", None)
         if tag is not None or isinstance(event, yaml.AliasEvent):
@@ -88,13 +88,13 @@ def _tags_and_aliases(text: str) -> Iterator[str]:
 
 
 def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Path) -> None:
-    """Refuse a configuration that would do anything but build what it may name.
+    """Refuse a configuration that names another target, or passes another argument, than it may.
 
     Args:
-        content: the configuration as plain data.
-        trusted: further packages, modules or objects by their dotted names; what is defined in them
+        content: The configuration as plain data.
+        trusted: The dotted names of further packages, modules or objects; what is defined in them
             may be named and gets any argument. The empty name trusts everything.
-        path: the file, for the message.
+        path: The file, for the message.
 
     Raises:
         PermissionError: naming file, position, target or argument, and the remedy.
@@ -106,9 +106,9 @@ def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Pa
 def nameable() -> frozenset[str]:
     """Return every name that a run's configuration may use as a target without further trust.
 
-    These are the targets of the shipped configuration in the sections of `BUILT`, the public
-    classes beside them in the same modules, and `FOREIGN`; by the names under which they are
-    public, and where they are defined.
+    These are `FOREIGN`, the targets of the shipped configuration in the sections of `BUILT`, and
+    the public classes of the same modules; all by their public names and by those of their
+    definitions.
     """
     shipped = {name for name in _shipped_targets() if name.startswith(f"{_PACKAGE}.")}
     objects = {name: locate(name) for name in (*FOREIGN, *shipped)}
@@ -123,7 +123,7 @@ def nameable() -> frozenset[str]:
 
 
 def locate(name: str) -> Any:
-    """Return what a dotted name means, imported as Hydra does, without leaving a package.
+    """Return the object of a dotted name, imported as Hydra does, without leaving its package.
 
     Raises:
         DetourError: when the name leads through a module under another name than its own.
@@ -176,11 +176,11 @@ def _home(found: Any) -> str:
 
 
 class _Check:
-    """A walk through one configuration.
+    """The check of one configuration.
 
     Args:
-        path: the file.
-        trusted: trusted names, see `require_trusted`.
+        path: The file.
+        trusted: The trusted names, see `require_trusted`.
     """
 
     def __init__(self, path: Path, trusted: tuple[str, ...]) -> None:
@@ -194,13 +194,13 @@ class _Check:
         )
 
     def walk(self, content: Any, position: str, name: str, *, is_limited: bool) -> None:
-        """Look at a value and everything in it.
+        """Check a value and everything in it.
 
         Args:
-            content: the value.
-            position: the value's dotted position in the file.
-            name: the key that it stands under, also in a list.
-            is_limited: flag of an argument of a target that is not the reader's own.
+            content: The value.
+            position: The value's dotted position in the file.
+            name: The value's key, or that of the list that it is in.
+            is_limited: Whether it is an argument of a target that the reader has not named.
         """
         if isinstance(content, dict):
             self.walk_mapping(content, position, is_limited=is_limited)
@@ -234,7 +234,7 @@ class _Check:
     def require_target(self, target: Any, position: str) -> bool:
         """Refuse a target that may not be named; return whether it may have any argument."""
         if isinstance(target, str):
-            # The reader has named this very object, or everything.
+            # Named by the reader: this very object, or everything.
             if "" in self.trusted or target in self.trusted:
                 return True
             if any(target.startswith(f"{name.rstrip('.')}.") for name in self.trusted):
@@ -252,14 +252,14 @@ class _Check:
         except DetourError as error:
             self.refuse(position, f"{expected} (but {error})", target)
         except ImportError:
-            # There is nothing to execute: Hydra will say that it cannot be found.
+            # There is nothing to execute; Hydra says that it cannot be found.
             return True
         if _home(found) in nameable():
             return False
         if inspect.isclass(found) or (inspect.isroutine(found) and not isinstance(found, partial)):
             is_defined = _top(str(getattr(found, "__module__", None))) == _top(target)
         else:
-            # Such as a functools.partial: its home is the module that it stands in.
+            # Such as a functools.partial, which counts as defined where it is a module's attribute.
             is_defined = isinstance(locate(target.rpartition(".")[0]), ModuleType)
         if not is_defined or isinstance(found, ModuleType) or ".__" in target:
             self.refuse(position, expected, target)

@@ -1,4 +1,4 @@
-"""One call that lets an environment publish its constraints."""
+"""Environments that publish their constraints, made in one call."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _EXAMPLE = "write constrain_env(env, SpeedLimit(), KeepDistance())"
 def constrain_env(
     env: EnvBase, *geometries: GeometryTransform, order: Sequence[str] | None = None
 ) -> TransformedEnv:
-    """Let an environment publish what each state allows: geometries, anchor and active flags.
+    """Return an environment that publishes the geometry of its constraints in every state.
 
-    The counterpart of `cnfp_torchrl.constrain`, which makes an actor heed them: it takes the
-    constraints, their order and the action bounds from the environment that this returns.
+    Beside the sets it publishes anchor, active flags and relaxations. `cnfp_torchrl.constrain`, the
+    counterpart, takes constraints, their order and the action bounds from the returned environment.
 
     Constraints that the environment publishes already come first, with lower priority.
 
@@ -30,8 +30,8 @@ def constrain_env(
             (lexicographic priority); None takes the order of the geometries.
 
     Raises:
-        TypeError: when the environment or a geometry is none, such as a class or a list, or when
-            the order is a string.
+        TypeError: when the environment is no `EnvBase`, a geometry is no `GeometryTransform` (but
+            a class or a list, for example), or the order is a string.
         ValueError: without geometries, or when an order does not name each constraint once.
     """
     if not isinstance(env, EnvBase):
@@ -41,17 +41,17 @@ def constrain_env(
         )
     if not geometries:
         raise ValueError(f"geometries: expected at least one, given none; {_EXAMPLE}")
-    for each in geometries:
-        if not isinstance(each, GeometryTransform):
+    for geometry in geometries:
+        if not isinstance(geometry, GeometryTransform):
             raise TypeError(
-                f"geometries: expected each to be a GeometryTransform, given {_kind(each)}; "
+                f"geometries: expected each to be a GeometryTransform, given {_kind(geometry)}; "
                 f"{_EXAMPLE}"
             )
-    known = any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
-    before = constraint_bijectors(env) if known else []
+    publishes = any(isinstance(t, ConstraintPublisher) for t in appended_transforms(env))
+    before = constraint_bijectors(env) if publishes else []
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
     _ = published.observation_spec  # calls each geometry for its first set
-    bijectors = [*before, *(own for each in geometries for own in each.bijectors)]
+    bijectors = [*before, *(own for geometry in geometries for own in geometry.bijectors)]
     return published.append_transform(ConstraintAnchor(bijectors, order))
 
 

@@ -19,15 +19,14 @@ Indicator = Callable[[TensorDictBase, TensorDictBase], Tensor]
 
 
 class ConstraintCost(Transform):
-    """Writes the indicators at ``cost``, and their running sum in the episode at ``episode_cost``.
+    """Writes indicators of violations at ``cost``, and their sum so far at ``episode_cost``.
 
     Both are float32 ``(*batch, K)``, one column for each name of `constraint_names`, and zero after
     a reset. ``cost`` under ``next`` is the cost of the action beside it.
 
     Args:
-        indicators: Functions by the constraint's name, for environments without costs; they see
-            the tensordicts before and after the step. None: the environment publishes ``cost``
-            itself.
+        indicators: Functions of the tensordicts before and after a step, by the constraint's name,
+            for environments without costs. None takes the ``cost`` that the environment publishes.
 
     Raises:
         TypeError: for indicators that are no mapping of names to functions.
@@ -65,7 +64,7 @@ class ConstraintCost(Transform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        # The sum so far is read at the root: batched environments must pass it to their workers.
+        # The sum so far is read at the root, so that batched environments pass it to their workers.
         state_spec = input_spec["full_state_spec"]
         if state_spec is None:
             state_spec = Composite(shape=input_spec.shape, device=input_spec.device)

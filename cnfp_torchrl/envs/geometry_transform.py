@@ -41,14 +41,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
     sampling, at the root and under ``next``, instead of being stored.
 
     Everything is checked here, eagerly, once a step, so that nothing has to be checked later in
-    compiled code. A set must be valid in every state, also where no action keeps the constraint:
-    publish one that misses the action bounds there; it is relaxed in that state, which is said.
-    All states' sets are of one family.
+    compiled code. A set must be valid in every state, even where no action keeps the constraint:
+    publish one that misses the action bounds there. It is relaxed in that state, and the relaxation
+    is published. The sets of all states are of one family.
 
     Args:
         name: The constraint's name, by which flow and order refer to it.
-        in_keys: The keys of what `constraint_set` reads; refused where not finite.
-
+        in_keys: The keys of the entries that `constraint_set` reads; values that are not finite are
+            refused.
         margin: The distance in action units by which every action is to stay inside, such as an
             actuator's error. The published set is moved inwards by it.
         resolution: The grid to which actions are rounded, to the nearest point, before they are
@@ -112,13 +112,13 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
         Args:
             tensordict: States of any batch size; not to be changed.
-            allowed: The set that `constraint_set` returned for them.
+            allowed: The set that is published for them.
         """
         return None
 
     @property
     def bijectors(self) -> list[ConstraintBijector]:
-        """The constraint's own, alone."""
+        """The module of this constraint, in a list of one."""
         if self._family is None:
             raise RuntimeError(
                 f"constraint '{self.name}': expected to be part of an environment whose specs were "
@@ -127,9 +127,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
         return [ConstraintBijector(self.name, self._family)]
 
     def checked_set(self, tensordict: TensorDictBase) -> ConstraintSet:
-        """Return `constraint_set` of some states, if it is a set of the same family as before.
+        """Return the set to publish in some states, if it is of the same family as before.
 
-        The values are not looked at.
+        It is moved inwards by margin and resolution. Its values are not checked.
 
         Raises:
             TypeError: when it is no `ConstraintSet`.
@@ -155,7 +155,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             raise
 
     def _moved_inwards(self, allowed: ConstraintSet) -> ConstraintSet:
-        """Return the set without what lies closer to its boundary than margin and rounding."""
+        """Return the set less all that is closer to its boundary than margin and rounding."""
         if self._inwards is None:
             self._inwards = self.margin + self._largest_rounding(allowed.dim)
         if self._inwards == 0:
@@ -169,7 +169,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         return allowed.inflated(first.new_full((1,), -self._inwards))
 
     def _largest_rounding(self, dim: int) -> float:
-        """Return the largest distance that rounding to the actuator's grid moves an action."""
+        """Return the largest distance by which rounding to the actuator's grid moves an action."""
         if self.resolution is None:
             return 0.0
         if not isinstance(self.resolution, torch.dtype):
@@ -220,7 +220,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Publish at the root and, if there is one, under ``next``: for use in a replay buffer."""
+        """Publish at the root and, where it exists, under ``next``: for use in a replay buffer."""
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
@@ -267,11 +267,11 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     @contextmanager
     def _naming_the_constraint(self, method: str) -> Iterator[None]:
-        """Add to errors of a constraint's own code which constraint and method it is."""
+        """Add the names of constraint and method to errors of a constraint's own code."""
         try:
             yield
         except AttributeError as error:
-            # As it is, an environment would take it for a missing spec and say no more than that.
+            # An environment would report the AttributeError itself as a missing spec.
             raise GeometryError(f"{self._at(method)}: AttributeError: {error}") from error
         except Exception as error:
             error.add_note(f"raised by {self._at(method)}")
@@ -293,10 +293,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
         allowed.validate_shapes(where)
 
     def _refuse_shapes_that_follow_the_batch(self, state: TensorDictBase) -> None:
-        """Refuse fields that put the states' batch where something of one set belongs.
+        """Refuse fields with the states' batch in a dimension that belongs to a single set.
 
-        One half-space for each state, given as normals ``(*batch, d)``, reads like as many
-        half-spaces as there are states, all of them for each state.
+        One half-space for each state, given as normals ``(*batch, d)``, has the shape of a single
+        set of as many half-spaces as there are states.
         """
         if state.numel() == 0:
             return

@@ -1,4 +1,4 @@
-"""What a replay buffer stores of states, once a state instead of twice a transition."""
+"""The storage of states in a replay buffer, once a state instead of twice a transition."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 STATE_KEY = "state"
-"""Where a stored transition says which its states are, in place of their entries."""
+"""The key of a stored transition's pointers to its two states, which replace their entries."""
 
 POINTER_BYTES = 12
-"""What a transition stores to find its two states."""
+"""The size of the pointers by which a transition finds its two states."""
 
 
 class _Field(NamedTuple):
-    """Where an entry stands in the bytes of a state."""
+    """The position of an entry in the bytes of a state."""
 
     key: NestedKey
     dtype: torch.dtype
@@ -37,11 +37,11 @@ class PackedStates(Transform):
     A transition therefore stores two pointers (`POINTER_BYTES`) into a ring of states, in which all
     entries of a state are one row of bytes, looked up together when transitions are sampled. A
     state is shared where the root of a transition equals, byte by byte, the next state of the one
-    before it in the same batch, or in the same place of the batch before, as collectors yield them;
-    any other order is right as well and merely stores more.
+    before it in the same batch, or at the same index of the batch before, as collectors yield them;
+    other orders are as correct, but store more.
 
-    States are dropped when no stored transition can refer to them any more, which takes for granted
-    that the buffer overwrites its oldest transitions first, as TorchRL's default writer does.
+    States are dropped when no stored transition can refer to them any more. This requires that the
+    buffer overwrites its oldest transitions first, as TorchRL's default writer does.
 
     Args:
         keys: The entries' keys, at the root and under ``next``.
@@ -55,14 +55,14 @@ class PackedStates(Transform):
         self._fields: list[_Field] = []
         self._rows: Tensor | None = None
         self._before: Tensor | None = None
-        # Of each batch in the buffer, oldest first: how many transitions, their oldest state.
+        # The number of transitions and the oldest state of each batch in the buffer, oldest first.
         self._batches: deque[tuple[int, int]] = deque()
         self._stored = 0
         self._batch_start = self._end = 0
 
     @property
     def nbytes(self) -> int:
-        """What the states take that stored transitions can refer to."""
+        """The bytes of all states that stored transitions can refer to."""
         if self._rows is None:
             return 0
         return (self._end - self._batches[0][1]) * self._rows.shape[-1]
@@ -72,7 +72,7 @@ class PackedStates(Transform):
         root, after = self._packed(tensordict), self._packed(tensordict.get("next"))
         count = len(root)
         number = torch.arange(count, device=root.device)
-        # Positions among what is new in this batch: its next states, then roots that are new.
+        # Positions among the new states of this batch: its next states, then roots that are new.
         position = torch.full_like(number, -1)
         if self._before is not None and len(self._before) == count:
             same = (root == self._before).all(-1)
@@ -93,7 +93,7 @@ class PackedStates(Transform):
         return packed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Put the entries back into sampled transitions."""
+        """Write the entries of the states into sampled transitions."""
         assert self._rows is not None
         pointers = tensordict.pop(STATE_KEY)
         root = pointers["root"]
@@ -107,7 +107,7 @@ class PackedStates(Transform):
         return tensordict
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {key: each for key, each in self.__dict__.items() if key in _STATE}
+        return {key: self.__dict__[key] for key in _STATE}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -141,7 +141,7 @@ class PackedStates(Transform):
         self._batch_start, self._end = start, start + len(rows)
         first = self._batches[0][1]
         if self._rows is None:
-            # Untouched memory takes no room: enough for episodes of 8 steps and longer.
+            # Enough for episodes of 8 steps and longer; memory that is not written takes no room.
             size = self._max_size + self._max_size // 8 + 2 * len(rows)
             self._rows = rows.new_empty(size, rows.shape[-1])
         if self._end - first > len(self._rows):

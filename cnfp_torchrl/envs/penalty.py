@@ -1,4 +1,4 @@
-"""The penalty transform: violations punished through the reward."""
+"""The penalty transform, which replaces the reward of violations."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from cnfp_torchrl.keys import COST_KEY, RAW_REWARD_KEY, REWARD_KEY
 
 
 class RewardPenalty(Transform):
-    r"""Puts a constant in the reward's place whenever a constraint is violated.
+    r"""Replaces the reward by a constant whenever a constraint is violated.
 
     .. math:: r' = -p \text{ if } \max_k c_k > 0, \text{ else } r
 
     The second baseline of Rietz et al. 2024 (arXiv 2405.01198), with p = 100: the agent is told of
-    the constraints by its reward alone. The environment's own reward stays at ``raw_reward`` under
-    ``next`` (zero after a reset), for returns are judged on it: append a `RewardSum` before this
+    the constraints by its reward alone. The environment's own reward, by which returns are judged,
+    stays at ``raw_reward`` under ``next`` (zero after a reset): append a `RewardSum` before this
     transform, and evaluate without it.
 
     Args:

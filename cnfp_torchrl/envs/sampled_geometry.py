@@ -19,9 +19,8 @@ from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 class SampledGeometry(Transform):
     """Computes constraints' sets in a replay buffer, at the root and under ``next`` in one pass.
 
-    The sets are those that the environment published in the same states, where they were checked:
-    nothing is checked again, and on a GPU nothing is waited for. Anchor and flags are no sets; they
-    are to be stored.
+    The environment published the same sets in the same states, and checked them: nothing is checked
+    again, so that on a GPU nothing waits. Anchor and flags are not computed here, but to be stored.
 
     Args:
         env: The environment whose transforms publish the sets.
@@ -37,40 +36,41 @@ class SampledGeometry(Transform):
         self._geometries = [geometries[name] for name in names]
         fields = _fields(env) if self._geometries else {}
         self.field_keys: list[NestedKey] = [
-            key for each in self._geometries for key in fields[each.name]
+            key for geometry in self._geometries for key in fields[geometry.name]
         ]
-        """What need not be stored."""
+        """The keys of the sets' fields, which need not be stored."""
         self.state_keys: list[NestedKey] = list(
-            dict.fromkeys(key for each in self._geometries for key in each.in_keys)
+            dict.fromkeys(key for geometry in self._geometries for key in geometry.in_keys)
         )
-        """What has to be stored of each state."""
+        """The keys of the entries of a state that have to be stored."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the sets' fields of sampled transitions."""
         parts = tensordict, tensordict.get("next")
-        states = torch.stack([each.select(*self.state_keys) for each in parts])
+        states = torch.stack([part.select(*self.state_keys) for part in parts])
         for geometry in self._geometries:
             allowed = geometry.checked_set(states)
             for field, value in allowed.fields().items():
                 event = value.shape[value.ndim - allowed.event_dims[field] :]
                 key = field_key(geometry.name, field)
-                for part, each in zip(parts, value.expand(*states.shape, *event), strict=True):
-                    part.set(key, each)
+                values = value.expand(*states.shape, *event)
+                for part, entry in zip(parts, values, strict=True):
+                    part.set(key, entry)
         return tensordict
 
 
 def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -> list[str]:
-    """Return the constraints whose sets are to be computed at sampling, to store few bytes.
+    """Return the constraints whose sets are computed at sampling because storing takes too much.
 
-    What an actor reads of ``constraints`` is stored once a state (`PackedStates`). The sets of a
-    constraint are stored where all that is stored fits the limit, the largest sets first, because
-    looking up takes less time than computing. Anchor, flags and relaxations, which take longest to
-    compute, always are, even where they alone exceed the limit.
+    The entries of ``constraints`` that an actor reads are stored once a state (`PackedStates`).
+    Sets are stored, the largest first, where all that is stored fits the limit, because looking up
+    takes less time than computing. Anchor, flags and relaxations, which take longest to compute,
+    are always stored, even where they alone exceed the limit.
 
     Args:
         env: The environment whose transforms publish the geometry.
         keys: The keys that the actor reads of a state.
-        limit: The bytes of a stored transition that may be for constraints.
+        limit: The largest number of bytes of a stored transition for constraints.
     """
     spec = env.observation_spec
     sizes = {
@@ -91,8 +91,8 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
 
 def _geometries(env: EnvBase) -> dict[str, GeometryTransform]:
     appended = appended_transforms(env)
-    return {each.name: each for each in appended if isinstance(each, GeometryTransform)}
+    return {t.name: t for t in appended if isinstance(t, GeometryTransform)}
 
 
 def _fields(env: EnvBase) -> dict[str, list[NestedKey]]:
-    return {each.name: each.geometry_keys for each in constraint_bijectors(env)}
+    return {b.name: b.geometry_keys for b in constraint_bijectors(env)}

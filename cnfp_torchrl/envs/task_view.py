@@ -1,7 +1,7 @@
-"""What an environment may show of its task: sentences, a map, time series and telling states.
+"""The view of a task that an environment may offer: sentences, a map, time series, chosen states.
 
-Explanations, figures, the stream and the audit work for any environment. One that knows more than
-its observation gives it to them through a `TaskView`, which its class returns by a method::
+Explanations, figures, the stream and the audit work for any environment. One that can show more
+than its observation does so through a `TaskView`, which a method of its class returns::
 
     class MyEnv(EnvBase):
         def task_view(self, env: EnvBase) -> TaskView:
@@ -24,24 +24,23 @@ from torchrl.envs import EnvBase, TransformedEnv
 Point = tuple[float, float]
 
 StateSetter = Callable[[EnvBase, TensorDictBase], TensorDictBase]
-"""``(env, states) -> shown``: put an environment into states, and return what it then shows.
+"""``(env, states) -> observed``: put an environment into states, and return what it then observes.
 
-It is given the environment without its transforms, and states of its batch size with the entries
-of its observation spec: such as it showed before, and drawn ones. What it returns needs no more
-than these entries, read from the environment anew: whoever calls it checks that they are those of
-the states.
+The environment comes without its transforms. The states are of its batch size and have the entries
+of its observation spec; some were observed before, others are drawn. The result needs these entries
+alone, read anew from the environment: the caller checks that they equal those of the states.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """Something on a map that stands still.
+    """A part of a map that does not move.
 
     Args:
-        name: path of the shape; slashes separate groups, as in ``walls/inner``.
-        color: on a light background, as ``#RRGGBB``.
-        color_on_dark: on a dark background; None takes the same.
-        label: for legends; None leaves it out of them.
+        name: The shape's path; slashes separate groups, as in ``walls/inner``.
+        color: The color on a light background, as ``#RRGGBB``.
+        color_on_dark: The color on a dark background; None takes the same.
+        label: The entry in legends; None makes none.
     """
 
     name: str
@@ -67,7 +66,7 @@ class Discs(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Marks(Shape):
-    """Places, drawn in one size whatever the map's."""
+    """Points, drawn in one size whatever the map's."""
 
     points: tuple[Point, ...]
 
@@ -81,16 +80,16 @@ class Polyline(Shape):
 
 @dataclass(frozen=True)
 class Map:
-    """A plane in which an agent moves, and what stands in it.
+    """A plane in which an agent moves, and the shapes in it.
 
     Args:
-        x: lowest and highest first coordinate.
-        y: lowest and highest second coordinate.
-        unit: of both, for the axes.
-        shapes: from bottom to top.
-        step_length: an action a moves the agent by ``step_length * a``; None where actions are no
-            moves, and sets of actions cannot be drawn in place.
-        goal_radius: of the disc in which a goal counts as reached; None draws none.
+        x: The lowest and highest first coordinate.
+        y: The lowest and highest second coordinate.
+        unit: The unit of both, for the axes.
+        shapes: The shapes from bottom to top.
+        step_length: The length by which an action a moves the agent, ``step_length * a``; None
+            where actions are no moves, so that sets of actions cannot be drawn on the map.
+        goal_radius: The radius of the disc in which a goal counts as reached; None draws none.
     """
 
     x: tuple[float, float]
@@ -116,10 +115,10 @@ class Series:
     """A number of each state, to be drawn over time.
 
     Args:
-        name: also that of the constraint whose color it has, if there is one.
-        unit: such as ``%``.
-        threshold: drawn as a line of its own.
-        limits: lowest and highest value that there can be.
+        name: The series' name; with that of a constraint it has the constraint's color.
+        unit: The unit, such as ``%``.
+        threshold: The value at which a line is drawn.
+        limits: The lowest and highest possible value.
     """
 
     name: str
@@ -135,7 +134,7 @@ class Series:
 
 
 class TaskView:
-    """What a task shows of its states; nothing, unless a subclass says otherwise."""
+    """The view of a task on its states, empty until a subclass overrides parts of it."""
 
     map: Map | None = None
     """The map, for tasks in a plane; then `position` is needed."""
@@ -147,14 +146,14 @@ class TaskView:
     """The entries of a state that `position` reads."""
 
     state_setter: StateSetter | None = None
-    """Puts the environment into chosen states, for audits; None where that cannot be done."""
+    """The function that puts the environment into chosen states; None where none can."""
 
     def position(self, states: TensorDictBase) -> Tensor:
-        """Return where the agent is on the map, ``(*batch, 2)``."""
+        """Return the agent's positions on the map, ``(*batch, 2)``."""
         raise NotImplementedError(f"{type(self).__name__} has a map and needs `position`")
 
     def goal(self, states: TensorDictBase) -> Tensor | None:
-        """Return where the agent has to go, ``(*batch, 2)``; None for tasks without a goal."""
+        """Return the goals' positions, ``(*batch, 2)``; None for tasks without a goal."""
         return None
 
     def series_values(self, states: TensorDictBase) -> Mapping[str, Tensor]:
@@ -170,13 +169,13 @@ class TaskView:
         return {}
 
     def candidate_states(self, env: EnvBase) -> tuple[TensorDictBase, TensorDictBase] | None:
-        """Return states ``(n,)`` among which to look for a permissive and for a restrictive one.
+        """Return states ``(n,)`` to choose a permissive one from, and others for a restrictive one.
 
         Args:
-            env: with all transforms; may be reset.
+            env: The environment with all transforms; may be reset.
 
         Returns:
-            Both sets of states, as the environment shows them; None looks along a random walk.
+            Both batches of states, as the environment publishes them; None takes a random walk's.
         """
         return None
 
@@ -186,14 +185,14 @@ NOTHING: TaskView = TaskView()
 
 
 def find_task_view(env: EnvBase | None) -> TaskView:
-    """Return what an environment shows of its task, below any transforms.
+    """Return the view of an environment, which may be below transforms; else an empty one.
 
     Environments that run in workers are not asked.
     """
     layer: object = env
     while layer is not None:
-        # Of the class: a batched environment that was never reset forwards a look at the instance
-        # to workers that there are not yet.
+        # Not hasattr(layer, ...): a batched environment that was never reset would forward that to
+        # its workers, which do not exist yet.
         if hasattr(type(layer), "task_view"):
             return layer.task_view(env)  # type: ignore[attr-defined]
         layer = layer.base_env if isinstance(layer, TransformedEnv) else _wrapped(layer)

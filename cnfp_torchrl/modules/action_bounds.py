@@ -1,4 +1,4 @@
-"""The action bounds of a spec, as a set and as a module that keeps them."""
+"""The action bounds of a spec, as a set and as a module that holds them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from cnfp_torchrl.keys import ACTION_KEY
 class ActionBounds(nn.Module):
     """The box of action bounds, in the dtype of the action spec, on any device.
 
-    A module whose tensors follow the device and nothing else. As buffers, ``.half()`` would round
-    them beyond the spec, and the ``state_dict`` of a TorchRL loss, which carries buffers that are
-    not persistent too, would replace them by another actor's.
+    Its tensors follow the device alone. They are no buffers: ``.half()`` would round those beyond
+    the spec, and loading the ``state_dict`` of a TorchRL loss, which has even buffers that are not
+    persistent, would replace them by another actor's.
 
     Args:
         box: The bounds, ``(d,)``.
@@ -40,8 +40,8 @@ class ActionBounds(nn.Module):
         return self._low.dtype
 
     def on(self, device: torch.device | None) -> Box:
-        """Return the bounds on a device; None stands for the one where the module is."""
-        # Asked for at each use: a loss moves parameters and buffers, not the modules they are of.
+        """Return the bounds on a device; None takes the module's."""
+        # At each use: a loss that is moved takes along parameters and buffers, not their modules.
         low, high = self._low.to(device), self._high.to(device)
         return Box(low, high, validate_args=False)
 
@@ -92,7 +92,7 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
 
 
 def refuse_other_bounds(what: str, bounds: Box, expected: Box) -> None:
-    """Refuse bounds that differ from those of the environment in which they are to hold.
+    """Refuse bounds other than those of the environment.
 
     Args:
         what: The owner of the bounds, for the message.

@@ -1,4 +1,4 @@
-"""Actors with hard action constraints: from a network, or from an actor that exists."""
+"""Actors with hard action constraints, made of a network or of another actor."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def make_constrained_actor(
         spec: The bounded action spec of one state, ``(d,)``; without `env`.
         order: The constraints' names in order of application: another order than that of
             `bijectors`, or a check of the environment's, which is set in `constrain_env`.
-        flow: The way to combine the sets, see `ConstrainedFlowModule`.
+        flow: The rule that combines the sets, see `ConstrainedFlowModule`.
         in_keys: The keys of what the network reads.
         return_log_prob: Whether to write the action's log-density, too.
 
     Raises:
         TypeError: when `env` is no environment, a sequence of names is a string, or a bijector is
-            none.
+            no `ConstraintBijector`.
         ValueError: when both or neither of `env` and `bijectors` with `spec` are given, when two
             statements differ, or see `ConstrainedFlowModule`.
     """
@@ -112,11 +112,11 @@ def constrain(
             own.
         order: The constraints' names in order of application: another order than that of
             `bijectors`, or a check of the environment's, which is set in `constrain_env`.
-        flow: The way to combine the sets, see `ConstrainedFlowModule`.
+        flow: The rule that combines the sets, see `ConstrainedFlowModule`.
 
     Raises:
         TypeError: when the actor does not end in a distribution that can be a base, when `env` is
-            no environment, a bijector is none, or the order is a string.
+            no environment, a bijector is no `ConstraintBijector`, or the order is a string.
         ValueError: when bounds are missing or are not those of the TanhNormal, when two statements
             differ, when the distribution is more than a Gaussian of location and scale, when an
             order does not name each constraint once, or when there would be no constraint.
@@ -144,7 +144,7 @@ def constrain(
         )
     if env is None:
         after = [*before, *after]
-    elif unknown := {each.name for each in before} - {each.name for each in after}:
+    elif unknown := {b.name for b in before} - {b.name for b in after}:
         raise ValueError(
             f"env: expected one that publishes the constraints that the actor has, given one "
             f"without {sorted(unknown)}; constrain the actor as it was before"
@@ -162,7 +162,7 @@ def constrain(
 
 
 class _Statement(NamedTuple):
-    """What was said of the constraints, by an environment or in its place."""
+    """The statement of constraints and bounds, by an environment or by the caller."""
 
     bijectors: list[ConstraintBijector] | None
     spec: TensorSpec | None
@@ -174,7 +174,7 @@ def _stated(
     spec: TensorSpec | None,
     order: Sequence[str] | None,
 ) -> _Statement:
-    """Return the one statement of constraints and bounds, or refuse two."""
+    """Return the one statement of constraints and bounds; refuse two that could differ."""
     refuse_string("order", order)
     if env is None:
         return _Statement(None if bijectors is None else in_order(bijectors, None), spec)
@@ -190,7 +190,7 @@ def _stated(
                 "leave one out"
             )
     published = constraint_bijectors(env)
-    names = [each.name for each in published]
+    names = [bijector.name for bijector in published]
     if order is not None and list(order) != names:
         raise ValueError(
             f"order: expected the environment's own, {names}, given {list(order)}; state the "
@@ -242,7 +242,7 @@ def flow_head(actor: ProbabilisticTensorDictSequential) -> ConstrainedFlowModule
 
 
 def has_density(actor: ProbabilisticTensorDictSequential) -> bool:
-    """Tell whether an actor's actions have a log-density, which projected ones have not."""
+    """Tell whether an actor's actions have a log-density; projected ones have none."""
     head = actor_modules(actor)[-1]
     return head.flow.has_density if isinstance(head, ConstrainedFlowModule) else True
 
@@ -265,7 +265,7 @@ def actor_modules(actor: ProbabilisticTensorDictSequential) -> list[Any]:
 
 
 def _parameter_keys(head: Any) -> list[NestedKey]:
-    """Return the keys of location and scale, or refuse a head that is no base of a flow."""
+    """Return the keys of location and scale; refuse a head that cannot be a flow's base."""
     if isinstance(head, ConstrainedFlowModule):
         return head.parameter_keys
     kind = getattr(head, "distribution_class", type(head))
@@ -309,7 +309,7 @@ def _refuse_other_tanh_bounds(head: Any, bounds: Box) -> None:
 
 
 def _other_options(head: Any) -> dict[str, Any]:
-    """Return what a head does besides its distribution, which another one is to do likewise."""
+    """Return a head's options besides its distribution, for a head that replaces it."""
     return {
         "return_log_prob": head.return_log_prob,
         "log_prob_key": head.log_prob_key,

@@ -23,7 +23,7 @@ from cnfp_torchrl.keys import (
 
 
 class ConstraintBijector(TensorDictModuleBase):
-    """Read the geometry of one constraint from a tensordict and turn it into a bijector.
+    """Turn the geometry of one constraint in a tensordict into a bijector.
 
     An actor takes such modules and combines their sets (`ConstrainedFlowModule`). Called alone, the
     module pushes the sample through the constraint's own squash and adds the log-determinant.
@@ -63,22 +63,22 @@ class ConstraintBijector(TensorDictModuleBase):
 
     @property
     def active_key(self) -> NestedKey:
-        """Where `ConstraintAnchor` says whether the constraint holds in a state."""
+        """The key of whether the constraint holds in a state, which `ConstraintAnchor` writes."""
         return active_key(self.name)
 
     @property
     def relaxation_key(self) -> NestedKey:
-        """Where `ConstraintAnchor` says by how much the constraint had to be widened in a state."""
+        """The key of the amount by which the constraint was widened, by `ConstraintAnchor`."""
         return relaxation_key(self.name)
 
     @property
     def row_relaxation_key(self) -> NestedKey | None:
-        """Where it says so row by row, if the family has rows."""
+        """The key of the same amounts row by row, None if the family has no rows."""
         return row_relaxation_key(self.name) if self.set_type.has_rows() else None
 
     @property
     def amounts_key(self) -> NestedKey:
-        """Where the amounts are by which a flow widens the set, row by row if there are rows."""
+        """The key of the amounts by which a flow widens the set, row by row if there are rows."""
         return self.row_relaxation_key or self.relaxation_key
 
     def get_set(self, tensordict: TensorDictBase) -> ConstraintSet:
@@ -122,20 +122,20 @@ def in_order(
         order: The constraints' names in order of application; None takes the bijectors' own.
 
     Raises:
-        TypeError: when a bijector is none, or the order is a string.
+        TypeError: when a bijector is no `ConstraintBijector`, or the order is a string.
         ValueError: when a name is unknown, missing or repeated.
     """
-    for each in bijectors:
-        if not isinstance(each, ConstraintBijector):
+    for bijector in bijectors:
+        if not isinstance(bijector, ConstraintBijector):
             raise TypeError(
                 "bijectors: expected a sequence of ConstraintBijector, given one with a "
-                f"{type(each).__name__} in it; write bijectors=constraint_bijectors(env)"
+                f"{type(bijector).__name__} in it; write bijectors=constraint_bijectors(env)"
             )
     refuse_string("order", order)
     names = [bijector.name for bijector in bijectors]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(
-            f"names: expected a name of its own for each constraint, given "
+            "names: expected a name of its own for each constraint, given "
             f"{repeated} more than once"
         )
     wanted = list(names if order is None else order)

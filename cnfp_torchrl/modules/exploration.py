@@ -1,4 +1,4 @@
-"""Exploration that would break constraints, refused by type."""
+"""The refusal of exploration modules that would break constraints."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torchrl.modules import (
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 
 EXPLORATION = (AdditiveGaussianModule, EGreedyModule, OrnsteinUhlenbeckProcessModule)
-"""TorchRL's modules that change an action after it was chosen."""
+"""TorchRL's modules that change an action after a policy has chosen it."""
 
 
 def refuse_exploration(policy: nn.Module) -> None:
-    """Refuse a policy that changes actions of a constrained flow by exploration of TorchRL's own.
+    """Refuse a policy in which one of TorchRL's exploration modules changes constrained actions.
 
-    Such noise knows the action bounds, not the constraints. On the latent, before a `FlowMap`, it
-    is carried to allowed actions and may stay.
+    Such noise respects the action bounds, not the constraints. On the latent, before a `FlowMap`,
+    it is mapped to allowed actions and is accepted.
 
     Args:
         policy: A policy, such as a sequence of a constrained actor and further modules.
@@ -27,8 +27,11 @@ def refuse_exploration(policy: nn.Module) -> None:
     Raises:
         TypeError: naming the exploration module and what to do.
     """
-    flows = (each for each in policy.modules() if isinstance(each, ConstrainedFlowModule))
-    actions = [flow.action_key for flow in flows]
+    actions = [
+        module.action_key
+        for module in policy.modules()
+        if isinstance(module, ConstrainedFlowModule)
+    ]
     for module in policy.modules():
         if isinstance(module, EXPLORATION) and any(key in actions for key in module.out_keys):
             raise TypeError(

@@ -28,11 +28,11 @@ _ANCHOR_REMEDY = "append cnfp_torchrl.envs.ConstraintAnchor after the geometry t
 
 
 class LostDensityWarning(UserWarning):
-    """An actor scored actions of its own as impossible, because rounding took their latents."""
+    """Stored actions of an actor have density 0 because rounding has lost their latents."""
 
 
 class _ActorFlow(ConstrainedFlow):
-    """The distribution of an actor, which tells where the latents of its own actions are lost."""
+    """The distribution of an actor, with a callback for its own actions whose latents are lost."""
 
     on_lost: Callable[[], None] | None = None
 
@@ -48,17 +48,20 @@ class _ActorFlow(ConstrainedFlow):
         lost = log_prob.isneginf()
         if not bool(lost.any()):
             return False
-        # On the boundary, as far as rounding can tell; further out it is somebody else's.
+        # On the boundary up to rounding; an action further out is not the actor's own.
         _, share = reach(self.bijector, value)
         return bool((lost & (share >= 1 - 64 * torch.finfo(value.dtype).eps)).any())
 
 
 class _ActorReferenceFlow(_ActorFlow, ReferenceEntropyFlow):
-    """The same, scored jointly by the reference entropy."""
+    """An actor's distribution that is scored by the reference entropy."""
 
 
 class ConstrainedFlowModule(SafeProbabilisticModule):
     """Draw actions from a Gaussian pushed through the bijectors of all constraints.
+
+    Unlike a projection appended to a network (OptLayer, a safety layer, HardNet), the bijectors
+    leave the policy a density on the allowed actions; see `cnfp_torchrl.modules.Flow`.
 
     Reads the Gaussian's parameters and, for each constraint, the geometry that the environment's
     transforms publish; an exact flow also reads the anchor and the active flags that
@@ -66,21 +69,21 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     modules do.
 
     Sets are eroded by the rounding error of the action spec's dtype, in which actions are executed:
-    geometry that comes in float64, from the observations of Gymnasium's MuJoCo environments for
-    example, is rounded to it first, by less than that margin. Actions of a float64 Gaussian are of
-    float64, and remain allowed when an environment rounds them to a float32 spec.
+    float64 geometry, as from the observations of Gymnasium's MuJoCo environments, is rounded to it
+    first, which moves it by less. Actions of a float64 Gaussian are float64, and remain allowed
+    when an environment rounds them to a float32 spec.
 
     Args:
         spec: The bounded action spec of one state, ``(d,)``; its bounds are stage 0 of the flow.
         bijectors: One `ConstraintBijector` for each constraint.
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
-        flow: The way to combine the sets: a `Flow`, or ``exact``, ``gauge``, ``radial``,
+        flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``radial``,
             ``squash``, ``projection``, ``unconstrained``.
         in_keys: The keys of the Gaussian's location and scale, each ``(*batch, d)``.
         out_key: The key of the action, ``(*batch, d)``.
         return_log_prob: Whether to write the action's log-density ``(*batch,)``, too.
-        default_interaction_type: The way to act where no exploration type is set.
+        default_interaction_type: The interaction type where no exploration type is set.
         kwargs: Further options of `torchrl.modules.SafeProbabilisticModule`, such as
             ``log_prob_key``.
 
@@ -152,12 +155,12 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
     @property
     def action_key(self) -> NestedKey:
-        """Where the action is written."""
+        """The key of the action."""
         return self.out_keys[0]
 
     @property
     def stage_names(self) -> list[str]:
-        """Names of the stages of ``get_dist(...).stages``, in order of application."""
+        """The names of the stages of ``get_dist(...).stages``, in order of application."""
         if self.flow.is_safe:
             return ["bounds", *self.order]
         return self.order if self.flow.reads_constraints and self.order else ["bounds"]
@@ -185,7 +188,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         if not self.flow.is_safe:
             return self.flow(bounds, sets)
         anchor = self._anchor(tensordict).to(self.action_dtype)
-        relaxation = tuple(each.to(self.action_dtype) for each in self._relaxation(tensordict))
+        relaxation = tuple(amount.to(self.action_dtype) for amount in self._relaxation(tensordict))
         return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
@@ -213,14 +216,12 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
     build_dist_from_params = get_dist
 
     def widened(self, value: Tensor) -> Tensor:
-        """Return a latent or its parameter, in the action spec's dtype if its own is coarser."""
-        if value.dtype == torch.float32:
-            return value.to(self.action_dtype)
-        # Half precision stays, to be refused.
-        return value
+        """Return a latent, or its parameter, in the action spec's dtype if that is finer."""
+        # Not half precision, which is left to be refused.
+        return value.to(self.action_dtype) if value.dtype == torch.float32 else value
 
     def random(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act on standard Gaussian noise, whatever the network says; writes that Gaussian too.
+        """Write actions of standard Gaussian noise, and that Gaussian's location and scale.
 
         The safe counterpart of TorchRL's method, which draws uniformly from the action spec.
         """
@@ -264,7 +265,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
 
     def _relaxation(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """Return by how much the rows of each set are widened, the bounds' by nothing."""
+        """Return the amounts by which the rows of each set are widened, 0 for the bounds."""
         amounts = [self._anchor(tensordict).new_zeros(())]
         for bijector in self.bijectors:
             amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
@@ -273,10 +274,10 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
 
 
 def refuse_other_batch(key: NestedKey, given: Tensor, batch: torch.Size) -> None:
-    """Refuse an entry with another batch shape than the sets: they would be broadcast amiss.
+    """Refuse an entry with another batch shape than the sets, which broadcasting may mismatch.
 
-    With one action for each of several agents, but one set for all of them, sets of a batch of as
-    many environments as there are agents would each be taken for another agent's.
+    With n agents that share one set in each of n environments, the set of the i-th environment
+    would be used for the i-th agent of all environments.
 
     Args:
         key: The entry's key.
@@ -295,6 +296,6 @@ def refuse_other_batch(key: NestedKey, given: Tensor, batch: torch.Size) -> None
 
 
 class ReferenceEntropyFlowModule(ConstrainedFlowModule):
-    """The same actions, scored for losses by the reference entropy (`ReferenceEntropyFlow`)."""
+    """A flow module whose actions are scored by the reference entropy (`ReferenceEntropyFlow`)."""
 
     distribution_type = _ActorReferenceFlow

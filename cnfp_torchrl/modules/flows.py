@@ -1,6 +1,6 @@
-"""The ways of combining the sets of all constraints into one bijector.
+"""The flows: rules that combine the sets of all constraints into one bijector.
 
-Each is a small callable, chosen by `_target_` in ``conf/flow/`` or by its name in `constrain`.
+A flow is a small callable, named by `_target_` in ``conf/flow/`` or by its name in `constrain`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
 
 
 class Flow(ABC):
-    """How the action bounds and the constraints' sets become one bijector."""
+    """A rule that turns the action bounds and the constraints' sets into one bijector."""
 
     is_safe: ClassVar[bool]
     """Whether every action satisfies all active constraints; then anchor and flags are needed."""
 
     reads_constraints: ClassVar[bool] = True
-    """Whether the constraints' sets are looked at."""
+    """Whether the constraints' sets are read."""
 
     has_density: ClassVar[bool] = True
     """Whether actions have a log-density; without one, only the reference entropy exists."""
@@ -85,19 +85,30 @@ class RegionFlow(Flow):
 
 
 class ExactFlow(RegionFlow):
-    """A tanh squash into the action bounds, then retractions into the intersection (default)."""
+    """A tanh squash into the action bounds, then retractions into the intersection (default).
+
+    The retractions are a bijective form of alpha projection, and scale along rays by the gauge, as
+    RAYEN does (Tordesillas et al. 2023, arXiv 2307.08336): `cnfp_torchrl.bijectors.ExactSquash`.
+    """
 
     squash = ExactSquash
 
 
 class GaugeFlow(RegionFlow):
-    """The exact flow with every retraction radial, of boxes too."""
+    """The exact flow with every retraction radial, of boxes too.
+
+    A set's gauge is its Minkowski functional: `cnfp_torchrl.bijectors.GaugeSquash`.
+    """
 
     squash = GaugeSquash
 
 
 class RadialFlow(RegionFlow):
-    """A radial squash straight onto the intersection; for one or two action dimensions."""
+    """A radial squash straight onto the intersection; for one or two action dimensions.
+
+    It scales along rays as the ray mask of continuous action masking (Stolz et al. 2024,
+    arXiv 2406.03704): `cnfp_torchrl.bijectors.RadialSquash`.
+    """
 
     squash = RadialSquash
 
@@ -105,10 +116,12 @@ class RadialFlow(RegionFlow):
 class SquashFlow(Flow):
     """The paper's chain of squashes, which guarantees the last constraint only.
 
+    Source: Rietz et al. 2024, arXiv 2405.01198, section Method.
+
     Args:
-        max_radius: balls are replaced by the ball of at most this radius inside them that is
-            nearest to 0; with the true radius of a permissive ball every sample would saturate the
-            tanh of a later box. In action units.
+        max_radius: The largest radius of balls, in action units. A larger one is replaced by the
+            ball of this radius inside it that is nearest to 0, because with the true radius of a
+            permissive ball every sample would saturate the tanh of a later box.
     """
 
     is_safe = False
@@ -128,22 +141,23 @@ class SquashFlow(Flow):
     ) -> Bijector:
         if not sets:
             return paper_squash(bounds)
-        return SquashChain(
-            [
-                paper_squash(each.inner_ball(self.max_radius) if isinstance(each, Ball) else each)
-                for each in sets
-            ]
-        )
+        return SquashChain([paper_squash(self._limited(allowed)) for allowed in sets])
+
+    def _limited(self, allowed: ConstraintSet) -> ConstraintSet:
+        return allowed.inner_ball(self.max_radius) if isinstance(allowed, Ball) else allowed
 
 
 class ProjectionFlow(RegionFlow):
-    """A baseline: the tanh-squashed Gaussian's action, projected onto the intersection.
+    """A baseline: the action of a tanh-squashed Gaussian, projected onto the intersection.
 
-    No bijection, so that no densities exist (`cnfp_torchrl.bijectors.Projection`). For boxes, balls
-    and half-spaces; a box with one ball, as in point navigation, is projected onto exactly.
+    As OptLayer (Pham et al., arXiv 1709.07643) and safety layers (Dalal et al. 2018, arXiv
+    1801.08757) do. It is no bijection, so that no densities exist
+    (`cnfp_torchrl.bijectors.Projection`). For boxes, balls and half-spaces; onto a box with one
+    ball it is exact.
 
     Args:
-        rounds: of Dykstra's algorithm, for other intersections; what it leaves is retracted.
+        rounds: The number of rounds of Dykstra's algorithm, for other intersections; actions that
+            are then still outside are retracted.
     """
 
     has_density = False
@@ -158,7 +172,7 @@ class ProjectionFlow(RegionFlow):
 
 
 class UnconstrainedFlow(Flow):
-    """The tanh squash into the action bounds alone, what any SAC does."""
+    """The tanh squash into the action bounds alone, as in any SAC."""
 
     is_safe = False
     reads_constraints = False

@@ -1,10 +1,10 @@
-r"""Constrained actors cut at the latent: what PPO, and deterministic policies such as TD3's, need.
+r"""Constrained actors split at the latent, for PPO and for deterministic policies such as TD3's.
 
-The flow :math:`a = f(z)` has no parameters, so a stored latent says all that a stored action says,
-and says it exactly. PPO's ratio is that of the latents' densities, because the log-determinants
-cancel, :math:`\pi_{new}(a|s) / \pi_{old}(a|s) = p_{new}(z|s) / p_{old}(z|s)`, whereas inverting a
-saturated float32 action loses it. Exploration noise added to the latent is carried to an allowed
-action; added to the action it breaks the constraints.
+The flow :math:`a = f(z)` has no parameters, so a stored latent determines the action, and is exact
+where the action is rounded. PPO's ratio is that of the latents' densities, because the
+log-determinants cancel, :math:`\pi_{new}(a|s) / \pi_{old}(a|s) = p_{new}(z|s) / p_{old}(z|s)`,
+whereas the inversion of a saturated float32 action loses the latent. Exploration noise added to the
+latent is mapped to an allowed action; added to the action it breaks the constraints.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, refuse_other
 
 
 class FlowMap(TensorDictModuleBase):
-    """Map a latent to an allowed action: the flow of a `ConstrainedFlowModule`, no sampling.
+    """Map a latent to an allowed action by the flow of a `ConstrainedFlowModule`, without sampling.
 
     It has no parameters. A deterministic policy is a network that writes the latent, exploration
     noise on the latent, and this map; a critic that reads latents is this map and a critic of
@@ -71,7 +71,7 @@ class FlowMap(TensorDictModuleBase):
 
 
 class LatentGaussian(IndependentNormal):
-    """The Gaussian under a flow, a distribution over latents that knows its action's entropy.
+    """The Gaussian under a flow: a distribution over latents, with the entropy of the actions.
 
     Args:
         flow: The distribution over actions; its base must be a Gaussian.
@@ -86,8 +86,8 @@ class LatentGaussian(IndependentNormal):
     def entropy(self) -> Tensor:
         """Return a one-sample estimate of the action's entropy, ``(*batch,)``, with its gradient.
 
-        Not the latent's, which would be rewarded for growing without end while all actions crowd at
-        the boundary.
+        The latent's own entropy is rejected: an entropy bonus would widen the Gaussian without end,
+        while all actions gather at the boundary.
         """
         return -self.flow.rsample_and_log_prob()[1]
 
@@ -112,10 +112,10 @@ class LatentScorer(SafeProbabilisticModule):
     build_dist_from_params = get_dist
 
     def named_modules(self, *args: Any, **kwargs: Any) -> Iterator[tuple[str, nn.Module]]:
-        """Leave the flow module out, which is a part and not a distribution of its own.
+        """Yield the modules without the flow module, which is a part of the distribution.
 
-        Among an actor's modules, tensordict takes the last probabilistic one for its distribution,
-        and losses count them.
+        tensordict takes the last probabilistic module of an actor for its distribution, and losses
+        count such modules.
         """
         for name, module in super().named_modules(*args, **kwargs):
             if module is not self.head:
@@ -123,7 +123,7 @@ class LatentScorer(SafeProbabilisticModule):
 
 
 class LatentActor(NamedTuple):
-    """A constrained actor cut at its latent; the networks are the actor's own.
+    """A constrained actor split at its latent; the networks are the actor's own.
 
     Args:
         policy: The policy for collectors and environments, which writes latent and log-density,
@@ -172,7 +172,7 @@ def split_at_latent(
         "default_interaction_type": head.default_interaction_type,
         "num_samples": head.num_samples,
     }
-    # Not the scorer, which would build each state's flow once more than acting needs.
+    # Not LatentScorer, which would build the flow of each state a second time.
     sampler = SafeProbabilisticModule(distribution_class=IndependentNormal, **options)
     return LatentActor(
         policy=TensorDictSequential(*body, sampler, FlowMap(head, latent_key)),

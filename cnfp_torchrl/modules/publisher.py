@@ -1,4 +1,4 @@
-"""The constraints that an environment publishes, as its transforms tell them."""
+"""The constraints that an environment publishes, read off its transforms."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
 
 
 class ConstraintPublisher(ABC):
-    """A transform of an environment that publishes constraints, and tells which.
+    """The interface of environment transforms that publish constraints.
 
     Implemented by the transforms of `cnfp_torchrl.envs`.
     """
 
     states_order: ClassVar[bool] = False
-    """Whether the list is of all constraints, in their order of application."""
+    """Whether `bijectors` are those of all constraints, in order of application."""
 
     @property
     @abstractmethod
     def bijectors(self) -> list[ConstraintBijector]:
-        """One for each constraint that the transform publishes."""
+        """The modules of the constraints that the transform publishes, one for each."""
 
 
 def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
@@ -32,18 +32,16 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
     that of its geometry transforms.
 
     Args:
-        env: An environment such as `constrain_env` returns; one, no batch of them in workers.
+        env: An environment such as `constrain_env` returns; not a batch of them in workers.
 
     Raises:
         ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out.
     """
-    publishers = [
-        each for each in appended_transforms(env) if isinstance(each, ConstraintPublisher)
-    ]
+    publishers = [t for t in appended_transforms(env) if isinstance(t, ConstraintPublisher)]
     if publishers:
-        _ = env.observation_spec  # made once, when each constraint is called for its first set
-    ordered = [each for each in publishers if each.states_order]
-    published = [b for each in publishers if not each.states_order for b in each.bijectors]
+        _ = env.observation_spec  # made at the first use, by a set of each constraint
+    ordered = [p for p in publishers if p.states_order]
+    published = [b for p in publishers if not p.states_order for b in p.bijectors]
     bijectors = ordered[-1].bijectors if ordered else published
     if not bijectors:
         raise ValueError(
@@ -52,8 +50,8 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
             "constrain_env, and before batching: the transforms in the workers of a SerialEnv or "
             "ParallelEnv are out of reach, so call this on one of the environments it is made of"
         )
-    known = {each.name for each in bijectors}
-    if left_out := [each.name for each in published if each.name not in known]:
+    known = {bijector.name for bijector in bijectors}
+    if left_out := [b.name for b in published if b.name not in known]:
         raise ValueError(
             f"env: expected its ConstraintAnchor to know all constraints, given one with "
             f"{sorted(known)} that leaves out {left_out}; pass all geometries to one constrain_env"
@@ -74,4 +72,4 @@ def appended_transforms(env: EnvBase) -> list[Transform]:
 def _flat(transform: Transform) -> list[Transform]:
     if not isinstance(transform, Compose):
         return [transform]
-    return [part for each in transform for part in _flat(each)]
+    return [part for child in transform for part in _flat(child)]

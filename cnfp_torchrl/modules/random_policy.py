@@ -19,7 +19,7 @@ class SafeRandomPolicy(TensorDictModuleBase):
     the flow module writes, and location 0 and scale 1 where a network would write its own.
 
     Args:
-        actor: A constrained actor; its networks are not asked.
+        actor: A constrained actor; its networks are not called.
 
     Raises:
         TypeError: when the actor is not a constrained one.
@@ -55,8 +55,8 @@ class WarmUpPolicy(TensorDictModuleBase):
             raise ValueError(f"frames: expected a number >= 0, given {frames}")
         self.actor = actor
         self.random = SafeRandomPolicy(actor)
-        # Not a number, for each value of which a policy would be compiled anew. On the host, where
-        # asking it does not wait for an accelerator.
+        # Not an int, for each value of which a compiled policy would be compiled anew. On the host,
+        # where reading it does not wait for an accelerator.
         self._frames_left = torch.tensor(frames)
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
 
@@ -77,11 +77,10 @@ class WarmUpPolicy(TensorDictModuleBase):
         super().__setstate__({**state, "_frames_left": torch.tensor(state["_frames_left"])})
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action of the policy whose turn it is."""
+        """Write a random action while frames are left, then the actor's."""
         if self._frames_left > 0:
             self._frames_left -= max(tensordict.numel(), 1)
-            # The actor runs too, for keys of its own besides the Gaussian's parameters: every step
-            # must carry the same ones.
+            # The actor runs too, for entries that it alone writes: all steps must have the same.
             self.actor(tensordict)
             return self.random(tensordict)
         return self.actor(tensordict)

@@ -1,8 +1,8 @@
-"""Distributions of an actor without the bookkeeping of its modules, which exceeds small networks'.
+"""Distributions of an actor without its modules' bookkeeping, which costs more than its network.
 
 tensordict 0.14 looks on disk for pandas at each entry that a TensorDictModule writes, which alone
-takes longer than a small network does. Modules that only call their network are therefore left out
-of the way here; any other actor is asked for its distribution as usual.
+takes longer than a small network does. Of modules that only call their network, the network is
+therefore called here; any other actor is asked for its distribution as usual.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cnfp_torchrl.modules import ConstrainedFlowModule, actor_modules
 _PLAIN_MODULES = (TensorDictModule, SafeModule, ValueOperator)
 
 _BLOCK = 16
-"""torch's generator on a CPU fills tensors of normal numbers in blocks of so many."""
+"""The size of the blocks in which torch's generator on a CPU fills tensors with normal numbers."""
 
 
 def is_plain(module: nn.Module) -> bool:
@@ -61,10 +61,13 @@ def distribution_of_both(
     for twice as many. The first states get no gradient from the actor's networks.
 
     Args:
-        actor: any; there is no such distribution for one that is not constrained, or where its
-            samples would not be those of two draws, the first batch's before the second's.
-        first: states ``(*batch,)``.
-        second: others, as many.
+        actor: Any actor.
+        first: States ``(*batch,)``.
+        second: Other states, as many.
+
+    Returns:
+        The distribution; None for an actor that is not constrained, and where samples would not be
+        those of two draws, the first batch's before the second's.
     """
     *body, head = actor_modules(actor)
     is_constrained = isinstance(head, ConstrainedFlowModule)
@@ -81,10 +84,10 @@ def distribution_of_both(
 
 
 class _Both:
-    """Two batches of states that are stacked entry by entry as these are read.
+    """Two batches of states, each entry stacked when it is read.
 
-    What of a tensordict a `ConstrainedFlowModule` asks for: building one, with its nested ones,
-    takes half as long as building the flow.
+    It has the part of a tensordict's interface that a `ConstrainedFlowModule` uses: stacking two
+    tensordicts, with their nested ones, would take half as long as building the flow.
     """
 
     def __init__(
@@ -106,7 +109,7 @@ class _Both:
 
 
 def _written(body: list[TensorDictModule], tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-    """Return what plain modules, applied in order, write."""
+    """Return the entries that plain modules write, applied in order."""
     written: dict[NestedKey, Tensor] = {}
     for module in body:
         keys = module.in_keys

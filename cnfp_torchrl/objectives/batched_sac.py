@@ -1,4 +1,4 @@
-"""TorchRL's SAC loss without the passes that it can do without."""
+"""TorchRL's SAC loss with critics, and states and next states, computed in one batch each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Drawn = tuple[Tensor, Tensor]
 
 
 class BatchedSACLoss(SACLoss):
-    """`torchrl.objectives.SACLoss` with the same arguments, keys, parameters and results, faster.
+    """A faster `torchrl.objectives.SACLoss`, with its arguments, keys, parameters and results.
 
     The critics are applied together, one batched matrix product a layer, where they are perceptrons
     (`StackedPerceptron`): a `torchrl.modules.MLP`, or a `torch.nn.Sequential`, of linear layers and
@@ -36,17 +36,17 @@ class BatchedSACLoss(SACLoss):
     one of the other, and a seed gives both the same noise on a CPU.
 
     Args:
-        args: as for `torchrl.objectives.SACLoss`.
-        kwargs: as for `torchrl.objectives.SACLoss`.
+        args: The arguments of `torchrl.objectives.SACLoss`.
+        kwargs: The options of `torchrl.objectives.SACLoss`.
     """
 
     _value_keys: ClassVar[dict[str, str]] = {"qvalue_network": "state_action_value"}
-    """Which of `tensor_keys` names the output of an ensemble."""
+    """The field of `tensor_keys` that names an ensemble's output, by the ensemble's name."""
 
     _ensembles: dict[str, StackedPerceptron | Callable[..., TensorDictBase]]
 
     def _make_vmap(self) -> None:
-        # SACLoss calls this when it is made, and when the randomness under vmap is set.
+        # Called by SACLoss when it is made, and when the randomness under vmap is set.
         super()._make_vmap()
         self._ensembles = {}
 
@@ -94,7 +94,7 @@ class BatchedSACLoss(SACLoss):
     def _critics_loss(
         self, tensordict: TensorDictBase, drawn: Drawn | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the critics' loss for next actions; without any, it draws where states go on."""
+        """Return the critics' loss, for next actions given as drawn or left for TorchRL to draw."""
         if drawn is None:
             target = self._compute_target_v2(tensordict)
         else:
@@ -152,13 +152,13 @@ class BatchedSACLoss(SACLoss):
     def _values(
         self, name: str, tensordict: TensorDictBase, action: Tensor, *, detached: bool = False
     ) -> Tensor:
-        """Return what all networks of an ensemble say of actions, ``(n, *batch, out)``.
+        """Return the values that all networks of an ensemble give actions, ``(n, *batch, out)``.
 
         Args:
-            name: of the ensemble, such as ``qvalue_network``; ``target_`` before it for its target.
-            tensordict: the states.
-            action: the actions.
-            detached: keep gradients from the networks' parameters.
+            name: The ensemble's name, such as ``qvalue_network`` or ``target_qvalue_network``.
+            tensordict: The states.
+            action: The actions.
+            detached: Whether the networks' parameters get no gradient.
         """
         online = name.removeprefix("target_")
         network = getattr(self, online)
@@ -186,7 +186,7 @@ class BatchedSACLoss(SACLoss):
     def _ensemble(
         self, network: TensorDictModule
     ) -> StackedPerceptron | Callable[..., TensorDictBase]:
-        """Return how to apply a network with several sets of parameters."""
+        """Return a function that applies a network with several sets of parameters."""
         if is_plain(network) and len(network.out_keys) == 1:
             stacked = StackedPerceptron.of(network.module)
             if stacked is not None:
@@ -210,9 +210,9 @@ class BatchedSACLoss(SACLoss):
         return {key.removeprefix("module."): value for key, value in leaves}
 
     def _actor_holds_its_parameters(self) -> bool:
-        """Tell whether the actor's own tensors are those that this loss keeps and trains.
+        """Tell whether the actor's own tensors are those that this loss trains.
 
-        They are, until this loss is moved, which leaves the actor's buffers where they were.
+        They are until this loss is moved, which leaves the actor's buffers on their device.
         """
         own, kept = self.actor_network, self.actor_network_params
         return self._remembered(
@@ -228,12 +228,12 @@ class BatchedSACLoss(SACLoss):
         )
 
     def _remembered(self, name: str, make: Callable[[], T]) -> T:
-        """Return what was made before, until this loss is moved.
+        """Return a value that is made once, and anew after this loss was moved.
 
-        For what takes long because modules list their parameters slowly. Nothing that a deep copy
-        would separate from them, such as their data or detached ones.
+        Modules list their parameters slowly, so that what is made of them is kept. It must hold the
+        parameters themselves: a deep copy would separate their data, or detached ones, from them.
         """
-        # Where LossModule keeps such things; it empties it when it is moved.
+        # LossModule's own cache, which it empties when it is moved.
         cache = self.__dict__.setdefault("_cache", {})
         if name not in cache:
             cache[name] = make()
@@ -241,7 +241,7 @@ class BatchedSACLoss(SACLoss):
 
     def __getstate__(self) -> dict[str, Any]:
         # What torch.vmap returns cannot be pickled.
-        kept = {key: each for key, each in self.__dict__.items() if "_vmap_q" not in key}
+        kept = {key: value for key, value in self.__dict__.items() if "_vmap_q" not in key}
         return {**kept, "_ensembles": {}, "_cache": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

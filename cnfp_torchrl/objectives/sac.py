@@ -20,7 +20,7 @@ Entropy = Literal["reference", "action"]
 
 
 class ConstrainedSACLoss(BatchedSACLoss):
-    r"""TorchRL's SAC loss with a choice of the entropy that is rewarded.
+    r"""The SAC loss of a constrained actor, with a choice of the entropy that is rewarded.
 
     ``action`` takes :math:`-\log\pi(a|s)`, the entropy of the action itself. ``reference`` leaves
     the retractions' log-determinants out: the entropy in the coordinates of the action bounds, for
@@ -29,16 +29,17 @@ class ConstrainedSACLoss(BatchedSACLoss):
     only the bonus differs.
 
     Args:
-        actor_network: a constrained actor (`make_constrained_actor`, `constrain`).
-        qvalue_network: reads observation and action, writes ``state_action_value``.
-        entropy: ``reference`` or ``action``.
-        gamma: discount factor, in [0, 1).
-        kwargs: passed on to `BatchedSACLoss`, which takes those of `torchrl.objectives.SACLoss`.
+        actor_network: A constrained actor (`make_constrained_actor`, `constrain`).
+        qvalue_network: A critic that reads observation and action and writes
+            ``state_action_value``.
+        entropy: The entropy that is rewarded, ``reference`` or ``action``.
+        gamma: The discount factor, in [0, 1).
+        kwargs: Further options of `torchrl.objectives.SACLoss`.
 
     Raises:
         ValueError: for an unknown entropy, for ``action`` where actions have no density, for a
-            discount outside [0, 1), and for a batched spec where the target entropy is to be
-            -d, from the spec.
+            discount outside [0, 1), and for a batched spec where the target entropy -d is to be
+            read from it.
     """
 
     def __init__(

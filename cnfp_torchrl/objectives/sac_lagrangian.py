@@ -1,4 +1,4 @@
-"""Soft actor-critic with a Lagrangian: constraints in expectation, beside hard ones."""
+"""Soft actor-critic with a Lagrangian for constraints in expectation."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.objectives import SACLoss
 
+from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
 
 _REFUSED = ("value_network", "skip_done_states")
@@ -36,9 +37,9 @@ class SACLagrangianLoss(ConstrainedSACLoss):
 
     with :math:`a \sim \pi(s)` in :math:`L_\pi` and :math:`L_\lambda`: a descent on
     :math:`L_\lambda` is the dual ascent on :math:`\lambda_k (E[Q_{c,k}] - \epsilon_k)`. Costs are
-    not negative, so with :math:`\epsilon_k = 0` a multiplier can only rise: the bound ends that, or
-    a small :math:`\epsilon_k > 0`. With several cost networks the largest cost counts. Nothing here
-    is guaranteed: constraints hold in expectation, once the critic is right.
+    not negative, so with :math:`\epsilon_k = 0` a multiplier can only rise, up to its bound; with a
+    small :math:`\epsilon_k > 0` it can fall again. With several cost networks the largest cost
+    counts. Nothing here is guaranteed: constraints hold in expectation, once the critic is right.
 
     Sources: Ha et al. 2020, "Learning to Walk in the Real World with Minimal Human Effort"
     (arXiv 2002.08550); Yang et al. 2021, "WCSAC: Worst-Case Soft Actor Critic for
@@ -49,18 +50,18 @@ class SACLagrangianLoss(ConstrainedSACLoss):
     ``cost_value_NAME``, the multiplier and :math:`E[Q_{c,k}]` of each constraint.
 
     Args:
-        actor_network: as for `ConstrainedSACLoss`.
-        qvalue_network: as for `ConstrainedSACLoss`.
-        cost_network: reads observation and action, writes ``state_action_cost`` ``(*batch, K)``;
-            best one that cannot be negative, as costs cannot.
-        thresholds: :math:`\epsilon_k \ge 0`, one for each constraint, in discounted costs: a
-            violation in every step is worth 1 / (1 - gamma_cost).
-        constraint_names: of the columns of ``cost``, for the log; None numbers them.
-        gamma_cost: discount of costs, in [0, 1).
-        lambda_init: where all multipliers start, in (0, lambda_max].
-        lambda_max: their bound, > 0.
-        num_cost_nets: how many cost networks of the same form, with weights of their own.
-        kwargs: passed on to `ConstrainedSACLoss`.
+        actor_network: The actor, see `ConstrainedSACLoss`.
+        qvalue_network: The critic, see `ConstrainedSACLoss`.
+        cost_network: A critic that reads observation and action and writes ``state_action_cost``
+            ``(*batch, K)``; best one that cannot be negative, as costs cannot.
+        thresholds: The bounds :math:`\epsilon_k \ge 0`, one for each constraint, in discounted
+            costs: a violation in every step is worth 1 / (1 - gamma_cost).
+        constraint_names: The names of the columns of ``cost``, for the log; None numbers them.
+        gamma_cost: The discount of costs, in [0, 1).
+        lambda_init: The multipliers' first value, in (0, lambda_max].
+        lambda_max: The multipliers' upper bound, > 0.
+        num_cost_nets: The number of cost networks, alike but for their weights.
+        kwargs: Further options of `ConstrainedSACLoss`.
 
     Raises:
         ValueError: for a bad argument, naming it, and in ``forward`` for costs of another shape
@@ -69,7 +70,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        cost: NestedKey = "cost"
+        cost: NestedKey = COST_KEY
         state_action_cost: NestedKey = "state_action_cost"
 
     default_keys = _AcceptedKeys
@@ -95,17 +96,15 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         num_cost_nets: int = 1,
         **kwargs: Any,
     ) -> None:
-        limits = [float(each) for each in thresholds]
-        if constraint_names is None:
-            constraint_names = [str(each) for each in range(len(limits))]
-        names = list(constraint_names)
+        limits = list(map(float, thresholds))
+        names = list(map(str, range(len(limits))) if constraint_names is None else constraint_names)
         _require(
             len(limits) == len(names) > 0,
             "thresholds",
             f"one number for each of the constraints {names}",
             limits,
         )
-        _require(all(0 <= each < math.inf for each in limits), "thresholds", "numbers >= 0", limits)
+        _require(all(0 <= x < math.inf for x in limits), "thresholds", "numbers >= 0", limits)
         _require(0 <= gamma_cost < 1, "gamma_cost", "a discount in [0, 1)", gamma_cost)
         _require(0 < lambda_max < math.inf, "lambda_max", "a number > 0", lambda_max)
         _require(
@@ -144,8 +143,8 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         return self.log_lagrange.detach().exp().clamp(max=self.lambda_max)
 
     def _bound(self) -> None:
-        # In place, as SACLoss bounds its temperature: clamping the output instead would leave the
-        # parameter to run away behind the bound, from where it would not come back in time.
+        # In place, as SACLoss bounds its temperature. With the output clamped instead, the
+        # parameter would run on beyond the bound, and take long to come back.
         self.log_lagrange.data.clamp_(max=math.log(self.lambda_max))
 
     def _set_in_keys(self) -> None:
@@ -193,8 +192,8 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         action = tensordict.get(self.tensor_keys.action)
         predicted = self._costs("cost_network", tensordict, action)
         target = self._cost_target(tensordict).expand_as(predicted)
-        # Not the robust loss of the value critic: it estimates something like a median, and that of
-        # a rare event, such as a violation that is mostly avoided, is its absence.
+        # Not the robust loss of the value critic, which estimates something like a median: that of
+        # a rare event, such as a violation that is mostly avoided, is 0.
         loss = (predicted - target).square()
         return self._reduced(loss.sum(-1).sum(0), tensordict)
 
@@ -202,7 +201,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         """Return the multipliers' loss.
 
         Args:
-            expected_cost: of each constraint under the policy, ``(K,)``.
+            expected_cost: The expected cost of each constraint under the policy, ``(K,)``.
         """
         self._bound()
         return -(self.log_lagrange.exp() * (expected_cost.detach() - self.thresholds)).sum()
@@ -219,9 +218,9 @@ class SACLagrangianLoss(ConstrainedSACLoss):
                 f"{tuple(cost.shape)}"
             )
         action, _ = self._draw(outcome)
-        after = self._costs("target_cost_network", outcome, action).amax(0)
-        goes_on = ~outcome.get(self.tensor_keys.terminated)
-        return cost + self.gamma_cost * goes_on * after
+        next_cost = self._costs("target_cost_network", outcome, action).amax(0)
+        continues = ~outcome.get(self.tensor_keys.terminated)
+        return cost + self.gamma_cost * continues * next_cost
 
     def _costs(
         self, name: str, tensordict: TensorDictBase, action: Tensor, *, detached: bool = False

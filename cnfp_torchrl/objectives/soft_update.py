@@ -1,4 +1,4 @@
-"""Target networks that follow in one operation."""
+"""The soft update of all target networks in one operation."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 
 class FusedSoftUpdate(SoftUpdate):
-    """`torchrl.objectives.SoftUpdate` of all targets in one ``foreach`` operation, nothing else.
+    """A `torchrl.objectives.SoftUpdate` that moves all targets in one ``foreach`` operation.
 
     Args:
-        loss_module: the loss whose ``target_..._params`` follow its ``..._params``.
-        kwargs: ``tau``, the share of the way that targets go in a step, or ``eps = 1 - tau``.
+        loss_module: The loss whose ``target_..._params`` follow its ``..._params``.
+        kwargs: The rate ``tau`` by which targets move to the parameters, or ``eps = 1 - tau``.
     """
 
     def __init__(self, loss_module: LossModule, **kwargs: Any) -> None:

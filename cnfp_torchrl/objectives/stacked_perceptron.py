@@ -26,24 +26,24 @@ _ELEMENTWISE = (
     nn.Softsign,
     nn.Tanh,
 )
-"""Activations that have no parameters and treat every number alike, in whatever layout it comes."""
+"""Activations without parameters that apply one function to every number, whatever the layout."""
 
 
 class _Linear(NamedTuple):
-    """Where a linear layer's weights stand among the stacked parameters; no bias has no name."""
+    """The names of a linear layer's weight and bias among the stacked parameters."""
 
     weight: str
     bias: str | None
 
 
 class StackedPerceptron:
-    """Apply a network of linear layers and elementwise activations, n times with other weights.
+    """Apply n networks of linear layers and elementwise activations that differ in weights alone.
 
     `torch.vmap` over `torch.func.functional_call` computes the same; here each layer is one batched
-    matrix product and nothing else.
+    matrix product.
 
     Args:
-        steps: linear layers and activations in order.
+        steps: The linear layers and activations in order.
     """
 
     def __init__(self, steps: Sequence[_Linear | Callable[[Tensor], Tensor]]) -> None:
@@ -51,11 +51,11 @@ class StackedPerceptron:
 
     @classmethod
     def of(cls, network: nn.Module) -> StackedPerceptron | None:
-        """Return how to apply a network, None if it is not of the kind described above.
+        """Return the stacked form of a network, or None if it has other parts than the class takes.
 
         Args:
-            network: such as `torchrl.modules.MLP`, or an `torch.nn.Sequential` of its parts. One
-                with hooks or lazy layers is not of the kind.
+            network: A network such as a `torchrl.modules.MLP`, or a `torch.nn.Sequential` of its
+                parts. Hooks and lazy layers are such other parts.
         """
         if type(network) is MLP and network._reshape_out:
             return None
@@ -77,8 +77,8 @@ class StackedPerceptron:
         """Return the outputs of all n networks, ``(n, *batch, out)``.
 
         Args:
-            inputs: of all networks, ``(*batch, in)``.
-            weights: the parameters by their names in the network, each ``(n, ...)``.
+            inputs: The input of all networks, ``(*batch, in)``.
+            weights: The parameters by their names in the network, each ``(n, ...)``.
         """
         batch = inputs.shape[:-1]
         # Features before batch: the weights then stand on the left as they are stored, and neither

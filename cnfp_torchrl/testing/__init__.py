@@ -16,6 +16,7 @@ Of slack and containment, and of what the search for anchors is told:
 - `check_slack_bounds_the_distance`: no action nearer than the slack is on the other side,
 - `check_slack_is_concave`: with the right gradient, unless `superlevel` is stated,
 - `check_superlevel`: it describes no more than the set, and all of a convex one,
+- `check_rows`, `check_inflated`: what is relaxed where the constraint cannot hold, and by how much,
 - `check_search_keeps_the_set`: what holds is not dropped,
 - `check_bounding_box`: it holds the set.
 

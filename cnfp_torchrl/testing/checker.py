@@ -22,6 +22,8 @@ ABOUT_THE_GIVEN_ANCHOR = (
     slacks.check_slack_bounds_the_distance,
     slacks.check_slack_is_concave,
     slacks.check_superlevel,
+    slacks.check_rows,
+    slacks.check_inflated,
     gauges.check_gauge_is_where_rays_leave,
 )
 ABOUT_ALL_ANCHORS = (

@@ -70,6 +70,35 @@ def check_slack_bounds_the_distance(example: Example) -> None:
         )
 
 
+def check_rows(example: Example) -> None:
+    """The smallest of `row_slacks` is the slack."""
+    action = example.actions(_COUNT)
+    slack, least = example.sets.slack(action), example.sets.row_slacks(action).amin(-1)
+    same = (slack == least) | ((slack - least).abs() <= _tolerance(example, slack))
+    expected = "rows of which the smallest slack is the set's"
+    require(example.sets, "row_slacks", same, expected, "a smallest of", least, action=action)
+
+
+def check_inflated(example: Example) -> None:
+    """`inflated` holds the actions with a slack of at least ``-by`` in every row, and no others."""
+    sets = example.sets
+    if not sets.can_be_inflated():
+        return
+    action = example.actions(_COUNT)
+    slacks = sets.row_slacks(action)
+    one = example.size.unsqueeze(-1)
+    for by in (
+        one * example.uniform(*slacks.shape[1:]),
+        one * example.uniform(*one.shape),
+        0 * one,
+    ):
+        wider = called(type(sets), "inflated", partial(sets.inflated, by))
+        room = (slacks + by).amin(-1)
+        agrees = (room.abs() <= _tolerance(example, room)) | (wider.contains(action) == (room > 0))
+        expected = "all actions with a slack of at least -by in every row, and no others"
+        require(sets, "inflated", agrees, expected, "slack + by of", room, action=action, by=by)
+
+
 def check_slack_is_concave(example: Example) -> None:
     """The slack is concave, and its gradient says so, unless `superlevel` is stated instead."""
     sets = example.sets

@@ -24,7 +24,7 @@ from cnfp_torchrl.keys import (
 from cnfp_torchrl.training.environment import counted_constraints
 
 NOT_COUNTED = "not counted"
-"""What is said where nothing judges a constraint: that is not the same as no violation."""
+"""The text in place of a count where nothing judges a constraint, which is not a count of 0."""
 
 
 class UncountedConstraintWarning(UserWarning):
@@ -81,27 +81,31 @@ def _sum(first: Mapping[str, int], second: Mapping[str, int]) -> dict[str, int]:
 
 
 class ConstraintTally:
-    """Counts steps and violations of each constraint, on the device until they are asked for.
+    """Counts steps and violations of each constraint, on the device until `counts` is called.
 
     Args:
-        judged: names of the columns of ``cost``.
-        constraints: names of the constraints that have geometry.
-        told: names of those whose active flag and relaxation stand in the tensordict.
+        judged: The names of the columns of ``cost``.
+        constraints: The names of the constraints that have geometry.
+        published: The names of those whose active flag and relaxation are in the tensordict.
     """
 
     def __init__(
-        self, judged: Sequence[str], constraints: Sequence[str] = (), told: Sequence[str] = ()
+        self, judged: Sequence[str], constraints: Sequence[str] = (), published: Sequence[str] = ()
     ) -> None:
-        self.judged, self.constraints, self.told = tuple(judged), tuple(constraints), tuple(told)
-        self._judged_told = [name for name in told if name in judged]
+        self.judged, self.constraints, self.published = (
+            tuple(judged),
+            tuple(constraints),
+            tuple(published),
+        )
+        self._judged_published = [name for name in published if name in judged]
         self._sums: dict[str, Tensor] = {}
 
     @classmethod
     def of(cls, env: EnvBase) -> Self:
         """Return the tally of an environment; warns of constraints that nothing judges."""
         judged = counted_constraints(env)
-        published = env.observation_spec.get(CONSTRAINTS_KEY, None)
-        entries = published.items() if isinstance(published, Composite) else ()
+        geometry = env.observation_spec.get(CONSTRAINTS_KEY, None)
+        entries = geometry.items() if isinstance(geometry, Composite) else ()
         specs = {name: spec for name, spec in entries if name not in RESERVED_NAMES}
         if missed := [name for name in specs if name not in judged]:
             given = f"cost has columns for {list(judged)}" if judged else "it has no cost"
@@ -112,20 +116,20 @@ class ConstraintTally:
                 UncountedConstraintWarning,
                 stacklevel=2,
             )
-        told = [name for name, spec in specs.items() if active_key(name)[-1] in spec.keys()]  # noqa: SIM118
-        return cls(judged, tuple(specs), told)
+        published = [name for name, spec in specs.items() if active_key(name)[-1] in spec.keys()]  # noqa: SIM118
+        return cls(judged, tuple(specs), published)
 
     def fresh(self) -> ConstraintTally:
         """Return another tally of the same constraints, which has counted nothing."""
-        return ConstraintTally(self.judged, self.constraints, self.told)
+        return ConstraintTally(self.judged, self.constraints, self.published)
 
     def add(self, transitions: TensorDictBase, counts: Tensor | None = None) -> None:
         """Count transitions of any batch shape.
 
         Args:
-            transitions: states with their active flags and amounts, and the costs under ``next``.
-            counts: mask of the transitions that count, in the order of the flattened batch; None
-                means all.
+            transitions: The states with active flags and relaxations, and the costs under ``next``.
+            counts: The mask of the transitions that count, in the order of the flattened batch;
+                None means all.
         """
         batch = transitions.reshape(-1)
         for name, value in self._measured(batch, counts):
@@ -143,10 +147,10 @@ class ConstraintTally:
             if counts is not None:
                 violated = violated * counts.unsqueeze(-1)
             yield "violations", violated.sum(0)
-        if not self.told:
+        if not self.published:
             return
-        active = torch.stack([batch.get(active_key(name)) for name in self.told], -1)
-        amount = torch.stack([batch.get(relaxation_key(name)) for name in self.told], -1)
+        active = torch.stack([batch.get(active_key(name)) for name in self.published], -1)
+        amount = torch.stack([batch.get(relaxation_key(name)) for name in self.published], -1)
         relaxed = ~active & amount.isfinite()
         states = torch.stack([active, relaxed, ~active & ~relaxed], -1)
         if counts is not None:
@@ -156,9 +160,9 @@ class ConstraintTally:
         amount = torch.where(relaxed, amount.double(), 0.0)
         yield "largest", amount.amax(0)
         yield "total", amount.sum(0)
-        if violated is not None and self._judged_told:
-            columns = violated[:, [self.judged.index(name) for name in self._judged_told]]
-            rows = [self.told.index(name) for name in self._judged_told]
+        if violated is not None and self._judged_published:
+            columns = violated[:, [self.judged.index(name) for name in self._judged_published]]
+            rows = [self.published.index(name) for name in self._judged_published]
             yield "while", (states[:, rows] * columns.unsqueeze(-1)).sum(0)
 
     def counts(self) -> dict[str, ConstraintCounts]:
@@ -181,21 +185,21 @@ class ConstraintTally:
 
         return ConstraintCounts(
             round(value("violations", self.judged)) if name in self.judged else None,
-            by_state("steps", self.told),
-            by_state("while", self._judged_told),
-            value("largest", self.told),
-            value("total", self.told),
+            by_state("steps", self.published),
+            by_state("while", self._judged_published),
+            value("largest", self.published),
+            value("total", self.published),
         )
 
 
 def violations_of(counts: Mapping[str, ConstraintCounts]) -> dict[str, int | None]:
     """Return the violating steps by constraint, None for those that nothing judges."""
-    return {name: each.violations for name, each in counts.items()}
+    return {name: count.violations for name, count in counts.items()}
 
 
 def constraint_reports(counts: Mapping[str, ConstraintCounts]) -> dict[str, dict[str, Any]]:
-    """Return as plain values the counts of those constraints whose state is told."""
-    return {name: each.report() for name, each in counts.items() if each.steps}
+    """Return the counts of the constraints whose active flag is published, as plain values."""
+    return {name: count.report() for name, count in counts.items() if count.steps}
 
 
 def count_text(violations: int | None) -> str:
@@ -204,15 +208,15 @@ def count_text(violations: int | None) -> str:
 
 
 def gave_way_text(report: Mapping[str, Any]) -> str:
-    """Say in words how often a constraint gave way or was broken, from its report; "" if never."""
+    """Return a phrase on how often a constraint gave way or was broken, "" if never."""
     steps: Mapping[str, int] = report["steps"]
     total, broken = sum(steps.values()), report["violations_while"]
-    said = []
+    phrases = []
     for state in CONSTRAINT_STATES[1:]:
         if count := steps[state]:
             amount = f" by up to {report['largest_relaxation']:.3g}" if state == "relaxed" else ""
-            said.append(f"{state}{amount} in {100 * count / total:.2g} % of steps")
-    if said or any(broken.values()):
+            phrases.append(f"{state}{amount} in {100 * count / total:.2g} % of steps")
+    if phrases or any(broken.values()):
         counts = ", ".join(f"{count} while {state}" for state, count in broken.items())
-        said.append(f"violations: {counts or NOT_COUNTED}")
-    return "; ".join(said)
+        phrases.append(f"violations: {counts or NOT_COUNTED}")
+    return "; ".join(phrases)

@@ -13,6 +13,7 @@ from cnfp_torchrl.envs import (
     constraint_bijectors,
     constraint_names,
 )
+from cnfp_torchrl.keys import COST_KEY
 
 
 def make_environment(
@@ -52,4 +53,4 @@ def make_environment(
 
 def counted_constraints(env: EnvBase) -> tuple[str, ...]:
     """Return the names of the columns of ``cost``; none if the environment counts nothing."""
-    return constraint_names(env) if "cost" in env.observation_spec.keys() else ()  # noqa: SIM118
+    return constraint_names(env) if COST_KEY in env.observation_spec.keys() else ()  # noqa: SIM118

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.configuration import require_fields
+from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     SafeRandomPolicy,
@@ -222,9 +223,9 @@ def _run_batch(
             on_step(transition)
         outcome = transition.get("next")
         tally.add(transition, running & wanted)
-        returns += running * outcome.get("reward").reshape(size)
+        returns += running * outcome.get(REWARD_KEY).reshape(size)
         if tally.judged:
-            costs += running.unsqueeze(-1) * outcome.get("cost").reshape(costs.shape)
+            costs += running.unsqueeze(-1) * outcome.get(COST_KEY).reshape(costs.shape)
         steps += int((running & wanted).sum())
         running = running & ~outcome.get("done").reshape(size)
         if not bool(running.any()):

@@ -181,10 +181,10 @@ class RunFolder:
                 raise self._unusable(f"has another {name!r} than {CONFIG}", error) from error
 
     def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
-        said = "" if error is None else f" ({type(error).__name__}: {error})"
+        reason = "" if error is None else f" ({type(error).__name__}: {error})"
         return ValueError(
             f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
-            f"{CONFIG}, but it {what}{said}; copy both anew from where the run was trained, or "
+            f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
         )
 

@@ -9,7 +9,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import PackedStates, SampledGeometry, constraints_to_sample
-from cnfp_torchrl.keys import ACTION_KEY, CONSTRAINTS_KEY
+from cnfp_torchrl.keys import ACTION_KEY, CONSTRAINTS_KEY, REWARD_KEY
 
 
 def prepare_buffer(
@@ -39,5 +39,5 @@ def prepare_buffer(
         buffer.append_transform(PackedStates(state, buffer.storage.max_size))
     if computed.field_keys:
         buffer.append_transform(computed)
-    outcome = [("next", key) for key in (*state, "reward", "done", "terminated")]
+    outcome = [("next", key) for key in (*state, REWARD_KEY, "done", "terminated")]
     return [*state, ACTION_KEY, *outcome, *other_keys]

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
+from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import (
     application_order,
@@ -92,7 +93,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
         buffer,
         env,
         actor.in_keys,
-        other_keys=[key for key in [("next", "cost")] if key in loss.in_keys],
+        other_keys=[key for key in [("next", COST_KEY)] if key in loss.in_keys],
         constraint_bytes=settings.constraint_bytes,
     )
 

@@ -109,3 +109,33 @@ def test_prints_the_outcome(run: Callable[..., str]) -> None:
     printed = run("double_integrator_cbf", "--steps", 100, "--agents", 16)
     assert "0 of 16 agents crossed the wall" in printed
     assert "0 of 1600 steps beyond" in printed
+
+
+@pytest.mark.filterwarnings("ignore::cnfp_torchrl.envs.RelaxedEverywhereWarning")
+@pytest.mark.parametrize("name", ["push", "straight"])
+def test_entered_too_fast_it_brakes_as_hard_as_it_can(
+    name: str, script: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At speed 3 the wall cannot be kept, and the policy, which pushes on, is slowed."""
+
+    def fast(self: object, tensordict: object = None) -> TensorDict:
+        position = torch.zeros(64, 2)
+        observation = torch.cat([position, 3 * TOWARDS.expand(64, 2)], dim=-1)
+        return TensorDict({"observation": observation}, [64])
+
+    monkeypatch.setattr(script.DoubleIntegrator, "_reset", fast)
+    control = CONTROLS.get(name) or script.push
+    steps = script.run(control, steps=120, agents=64)
+    start, end = (steps[key].double() for key in ("observation", ("next", "observation")))
+    towards = TOWARDS.double()
+    gap, speed = 1 - end[..., :2] @ towards, start[..., 2:] @ towards
+    pushed = steps["action"].double() @ towards
+    relaxed = ~steps["constraints", "wall", "active"]
+    assert relaxed[:, 0].all()
+    # The hardest braking of the action bounds, up to the leeway, a thousandth of their width, and
+    # what float32 can tell apart of a half-space 60 away.
+    beyond = steps["constraints", "wall", "relaxation"][relaxed] > 0.01
+    assert (pushed[relaxed][beyond] < -1.4 + 1e-3 * 2 + 3e-3).all()
+    # From speed 3 that takes 3^2 / (2 * 1.4); without braking they would go on for ever.
+    assert gap.min() > 1 - 9 / 2.8 - 0.05
+    assert speed[:, -1].max() < 0.05

@@ -28,6 +28,18 @@ class PlainBall(Ball):
     unless_dropped = ConstraintSet.unless_dropped
 
 
+class InflatedByAShare(PlainBall):
+    """Relative where it should be absolute."""
+
+    def inflated(self, by: Tensor) -> Self:
+        return type(self)(self.center, self.radius * (1 + by.squeeze(-1)), validate_args=False)
+
+
+class RowsDeeperThanTheSet(PlainBall):
+    def row_slacks(self, action: Tensor) -> Tensor:
+        return 2 * super().row_slacks(action)
+
+
 class GaugeOfTheWrongSign(PlainBall):
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return super().gauge(-direction, anchor)
@@ -287,6 +299,8 @@ BROKEN: list[tuple[type[ConstraintSet], str]] = [
     (SmallBoundingBox, "bounding_box"),
     (SuperlevelElsewhere, "superlevel"),
     (SuperlevelOfAPart, "superlevel"),
+    (InflatedByAShare, "inflated"),
+    (RowsDeeperThanTheSet, "row_slacks"),
     (ViolationsOfTheExample, "invalid_fields"),
     (ViolationsOfNoField, "invalid_fields"),
     (EventDimsOfTheRadius, "event_dims"),

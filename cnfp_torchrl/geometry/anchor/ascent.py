@@ -27,13 +27,13 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows
 
 LEVEL = 0.2
-"""How far the level lies below the smallest slack, as a share of what this may still gain."""
+"""The distance of the level below the smallest slack, as a share of what that may still gain."""
 
 LONGEST = 1.7
-"""The length of a step, in Newton steps, at most: these are short where an inequality is near."""
+"""The largest length of a step, in Newton steps, which are short near an inequality."""
 
 FALL = 0.5
-"""By which share of its distance from the level an inequality may come nearer in one step."""
+"""The share of its distance from the level by which an inequality may come nearer in one step."""
 
 
 class _Cone(NamedTuple):
@@ -46,14 +46,14 @@ class _Cone(NamedTuple):
     square: Tensor
 
 
-class _View(NamedTuple):
-    """What is seen from a point: slacks beyond the level, inverted, and derivatives.
+class _Derivatives(NamedTuple):
+    """Inverse slacks beyond the level at a point, and their derivatives.
 
     Attributes:
-        inverse: of all M inequalities, the sides of the boxes first, ``(M, B)``.
-        gradient: of the slacks of those behind the boxes, ``(M - 2 d, d, B)``.
-        pull: the sum of all gradients times the inverses, ``(d, B)``.
-        curvature: what the cones' curvature adds to the Hessian, ``(d, d, B)`` each.
+        inverse: inverses of all M inequalities, the sides of the boxes first, ``(M, B)``.
+        gradient: gradients of the slacks of those behind the boxes, ``(M - 2 d, d, B)``.
+        pull: sum of all gradients times the inverses, ``(d, B)``.
+        curvature: terms of the Hessian for the curvature of the cones, ``(d, d, B)`` each.
     """
 
     inverse: Tensor
@@ -66,9 +66,9 @@ class Ascent:
     """Points that move inwards, and upper bounds of the best slack.
 
     Args:
-        sets: of batch shapes that broadcast to that of the start; the first are the action bounds.
-            Those that do not describe their `superlevel` are left out, and of non-convex ones a
-            convex part counts.
+        sets: sets of batch shapes that broadcast to that of the start; the first are the action
+            bounds. Sets without a `superlevel` are left out, and of non-convex ones a convex part
+            counts.
         start: points within the bounds, ``(*batch, d)``.
         upper: upper bounds of the best slack, such as half of the bounds' width, ``(*batch,)``.
     """
@@ -82,25 +82,25 @@ class Ascent:
         self.x = (self._last(start) - self.middle) / self.half
         self.upper = self._last(upper, 0)
         self.least = torch.full_like(self.upper, -torch.inf)
-        self.sees_all = all(type(each).part_near is ConstraintSet.part_near for each in sets)
-        boxes = [each for each in sets if isinstance(each, Box)]
-        high = [self._last(each.high - middle) for each in boxes]
-        low = [self._last(middle - each.low) for each in boxes]
+        self.sees_all = all(type(s).part_near is ConstraintSet.part_near for s in sets)
+        boxes = [box for box in sets if isinstance(box, Box)]
+        high = [self._last(box.high - middle) for box in boxes]
+        low = [self._last(middle - box.low) for box in boxes]
         self.sides = torch.cat([_least(high), _least(low)])
         self.normals: Tensor | None = None
         self.offsets: Tensor | None = None
         self.cones: list[_Cone] = []
         self.sums: list[tuple[Tensor, Tensor, Tensor]] = []
         rows = []
-        for each in sets:
-            part = None if isinstance(each, Box) else each.superlevel()
+        for constraint_set in sets:
+            part = None if isinstance(constraint_set, Box) else constraint_set.superlevel()
             if isinstance(part, Rows):
                 rows.append(self._rows(part, middle, half))
             elif isinstance(part, Cone):
                 self.cones.append(self._cone(part, middle, half))
             elif isinstance(part, KinkedSum):
                 self.sums.append(self._sum(part))
-            elif not isinstance(each, Box):
+            elif not isinstance(constraint_set, Box):
                 self.sees_all = False
         if rows:
             self.normals = torch.cat([normal for normal, _ in rows])
@@ -119,31 +119,32 @@ class Ascent:
     def run(self, steps: int) -> None:
         """Take some steps, and improve the bounds with each of them."""
         for _ in range(steps):
-            self._step(self._look())
-        self._look()
+            self._step(self._evaluate())
+        self._evaluate()
 
     def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
         """Take steps until all points are deep enough or cannot be, and tell which are.
 
         Args:
-            steps: at most so many.
-            share: of the best slack that will do.
-            depth: the least slack that will do, ``(*batch,)``.
+            steps: largest number of steps.
+            share: share of the best slack that is enough.
+            depth: least slack that is enough, ``(*batch,)``.
 
         Returns:
             Whether the points are deep enough, boolean ``(*batch,)``.
         """
         least = self._last(depth, 0)
         for step in range(steps + 1):
-            view = self._look()
+            at = self._evaluate()
             deep = (self.least >= least) & (self.least >= share * self.upper)
             if step == steps or bool((deep | (self.upper < -least)).all()):
                 break
             # Those that are deep enough stay.
-            self._step(view, deep)
+            self._step(at, deep)
         return deep.view(self.shape)
 
-    def _look(self) -> _View:
+    def _evaluate(self) -> _Derivatives:
+        """Return the derivatives at the points, and improve the bounds by them."""
         step = self.half * self.x
         values, gradients, curved = [self.sides - torch.cat([step, -step])], [], []
         if self.normals is not None and self.offsets is not None:
@@ -183,26 +184,25 @@ class Ascent:
         for place, (cone, bend) in enumerate(zip(self.cones, curved, strict=True), first):
             along = gradient[place].unsqueeze(0) * gradient[place].unsqueeze(1)
             curvature.append((rest[place] * bend) * (cone.square - along))
-        return _View(inverse, gradient, pull, curvature)
+        return _Derivatives(inverse, gradient, pull, curvature)
 
-    def _step(self, view: _View, stays: Tensor | None = None) -> None:
-        above, below, rest = view.inverse.split(
-            [self.dim, self.dim, len(view.inverse) - 2 * self.dim]
-        )
+    def _step(self, at: _Derivatives, stays: Tensor | None = None) -> None:
+        """Take a Newton step, shortened, from all points but those that stay."""
+        above, below, rest = at.inverse.split([self.dim, self.dim, len(at.inverse) - 2 * self.dim])
         hessian = torch.diag_embed(
             (self.half.square() * (above.square() + below.square())).mT, dim1=0, dim2=1
         )
         if len(rest):
-            scaled = rest.unsqueeze(1) * view.gradient
+            scaled = rest.unsqueeze(1) * at.gradient
             hessian = hessian + (scaled.unsqueeze(1) * scaled.unsqueeze(2)).sum(0)
-        for each in view.curvature:
-            hessian = hessian + each
-        move = _solve(hessian, view.pull)
+        for curvature in at.curvature:
+            hessian = hessian + curvature
+        move = _solve(hessian, at.pull)
         step = self.half * move
         changes = [-step, step]
         if len(rest):
-            changes.append((view.gradient * move).sum(1))
-        fall = (torch.cat(changes) * view.inverse).amin(0)
+            changes.append((at.gradient * move).sum(1))
+        fall = (torch.cat(changes) * at.inverse).amin(0)
         share = (-FALL / fall.clamp(max=-1e-3)).clamp(max=LONGEST)
         if stays is not None:
             share = share.masked_fill(stays, 0)
@@ -214,7 +214,7 @@ class Ascent:
         rates = part.rates.masked_fill(part.rates == 0, 1)
         normals = part.normals / rates.unsqueeze(-1)
         offsets = part.offsets / rates - (normals * middle.unsqueeze(-2)).sum(-1)
-        # Rows that let every action pass never come near.
+        # Rows that let every action pass are far away, not infinitely far: 0 times infinity is NaN.
         far = 1e3 * half.sum(-1, keepdim=True)
         offsets = torch.where(part.offsets.isinf(), far, offsets)
         normals = normals.masked_fill(part.offsets.isinf().unsqueeze(-1), 0)
@@ -236,8 +236,8 @@ class Ascent:
         free = part.rate == 0
         rate = part.rate.masked_fill(free, 1)
         size = (part.size / rate).masked_fill(free, torch.finfo(rate.dtype).max ** 0.25)
-        sides = (each / rate.unsqueeze(-1) for each in (part.upper, part.lower))
-        upper, lower = (self._last(each) for each in sides)
+        slopes = (slope / rate.unsqueeze(-1) for slope in (part.upper, part.lower))
+        upper, lower = (self._last(slope) for slope in slopes)
         return upper, lower, self._last(size, 0)
 
     def _last(self, value: Tensor, events: int = 1) -> Tensor:

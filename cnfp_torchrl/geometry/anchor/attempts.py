@@ -13,33 +13,33 @@ from cnfp_torchrl.geometry.anchor.depth import row_depths
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
 STEPS = 6
-"""Steps inwards: more decide tighter states, which the search takes otherwise."""
+"""The number of steps inwards; more would decide tighter states, which the search takes now."""
 
 REFINEMENTS = (4, 3, 5)
-"""Steps inwards between looks at which states need more of them."""
+"""The numbers of steps inwards after which it is looked which states need more of them."""
 
 SHARE = 0.3
-"""The share of the best slack with which an attempt is content."""
+"""The share of the best slack that is enough for an attempt."""
 
 
 @torch.no_grad()
 def attempt_anchor(
     sets: Sequence[ConstraintSet], candidate: Tensor | None = None, steps: int = STEPS
 ) -> tuple[Tensor, Tensor]:
-    """Find anchors where all sets hold together and a few passes tell where.
+    """Find anchors in states in which all sets hold together and a few passes show where.
 
-    Tensors alone, without a look at their values: it compiles and exports. In the dtype of the
-    sets. An undecided state says nothing: `lexicographic_anchor` decides it.
+    Computes in the dtype of the sets and reads no tensor on the host, so that it compiles and
+    exports. A state left undecided is one for `lexicographic_anchor`.
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds.
         candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        steps: the number of steps inwards, 0 or more.
+        steps: number of steps inwards, 0 or more.
 
     Returns:
-        The anchors ``(*batch, d)``, and whether they do, boolean ``(*batch,)``: in every row of
-        every set they have the depth that it asks for (`row_depths`), and at least 0.3 of the best
-        slack in all sets. Of non-convex sets a convex part counts for that.
+        Points ``(*batch, d)``, and the flags of those that are anchors, boolean ``(*batch,)``: they
+        have the depth of `row_depths` in every row of every set, and at least 0.3 of the best slack
+        in all sets. Of non-convex sets a convex part counts.
 
     Raises:
         GeometryError: when the first set is no box.
@@ -52,7 +52,7 @@ def attempt_anchor(
 
 
 class Attempt(NamedTuple):
-    """Points, upper bounds of the best slack, and whether the points will do, ``(*batch, ...)``."""
+    """Points, upper bounds of the best slack, and whether the points are anchors."""
 
     anchor: Tensor
     upper: Tensor
@@ -71,8 +71,8 @@ class Attempt(NamedTuple):
 def first_attempt(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], candidate: Tensor | None
 ) -> Attempt:
-    """Try the middle of all bounding boxes, the action 0, and a candidate on its way there."""
-    boxes = [each.bounding_box() for each in sets]
+    """Try the middle of all bounding boxes, 0, and points between a candidate and the middle."""
+    boxes = [constraint_set.bounding_box() for constraint_set in sets]
     low = torch.stack(torch.broadcast_tensors(*(box.low for box in boxes))).amax(0)
     high = torch.stack(torch.broadcast_tensors(*(box.high for box in boxes))).amin(0)
     middle = (low + high) / 2
@@ -86,7 +86,7 @@ def first_attempt(
 def further_attempt(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt, steps: int
 ) -> Attempt:
-    """Go on with some steps inwards."""
+    """Take some steps inwards from where an attempt ended."""
     ascent = Ascent(sets, before.anchor, before.upper)
     ascent.run(steps)
     return _roomiest(sets, depths, [ascent.point, before.anchor], ascent.bound)
@@ -95,14 +95,14 @@ def further_attempt(
 def refined_attempt(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt
 ) -> Attempt:
-    """Go on with steps inwards, and look now and then which states need more of them.
+    """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
-        sets: of batch shape ``(B,)``, as is all else.
-        depths: that their rows ask for.
-        before: where to begin.
+        sets: sets of batch shape ``(B,)``.
+        depths: depths of their rows (`row_depths`), ``(B, m)`` for each set.
+        before: attempt to start from.
     """
-    anchor, upper, decided = (each.clone() for each in before)
+    anchor, upper, decided = (value.clone() for value in before)
     left = torch.arange(len(decided), device=decided.device)
     for steps in REFINEMENTS:
         ascent = Ascent(sets, before.anchor, before.upper)
@@ -119,8 +119,8 @@ def refined_attempt(
         if not len(hard):
             break
         if len(hard) < len(left):
-            sets = [each.select(found.decided.shape, hard) for each in sets]
-            depths = [each[hard] for each in depths]
+            sets = [s.select(found.decided.shape, hard) for s in sets]
+            depths = [depth[hard] for depth in depths]
             left, found = left[hard], found.select(hard)
         before = found
     return Attempt(anchor, upper, decided)
@@ -129,14 +129,14 @@ def refined_attempt(
 def _roomiest(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
-    """Choose those of some points that have most slack beyond the depth."""
-    shape = broadcast_shape(*(each.batch_shape for each in sets), *(p.shape[:-1] for p in points))
+    """Choose the points with the most slack beyond the depth."""
+    shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
-    slacks = [each.row_slacks(stacked) for each in sets]
+    slacks = [s.row_slacks(stacked) for s in sets]
     rooms = [(slack - depth).amin(-1) for slack, depth in zip(slacks, depths, strict=True)]
     room, slack = (
-        torch.stack(torch.broadcast_tensors(*each)).amin(0)
-        for each in (rooms, [slack.amin(-1) for slack in slacks])
+        torch.stack(torch.broadcast_tensors(*values)).amin(0)
+        for values in (rooms, [slack.amin(-1) for slack in slacks])
     )
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)

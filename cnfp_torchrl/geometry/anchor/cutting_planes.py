@@ -1,4 +1,4 @@
-"""The largest smallest slack when some sets state no more than a concave slack."""
+"""The largest smallest slack in sets some of which state a concave slack alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cnfp_torchrl.geometry.anchor.program import Program
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 MAX_CUTS = 300
-"""Linearizations of each set after which the best point so far must do."""
+"""The number of linearizations of each set after which the best point so far is taken."""
 
 
 def maximize_slack_by_cuts(
@@ -34,13 +34,13 @@ def maximize_slack_by_cuts(
 
     Args:
         problem: B problems in float64, without the sets.
-        sets: the further sets, each of batch shape ``(B,)``, in float64.
-        required: their slacks, which those on trial exceed by t, ``(B, len(sets))``.
-        trial: which of them are on trial, boolean.
-        counts: which of them count, boolean.
+        sets: further sets, each of batch shape ``(B,)``, in float64.
+        required: slacks that those on trial exceed by t, ``(B, len(sets))``.
+        trial: flags of the sets on trial, boolean ``(B, len(sets))``.
+        counts: flags of the sets that count, boolean ``(B, len(sets))``.
         start: points strictly inside of all that must hold, ``(B, d)``.
-        scale: the mean widths of the action bounds, ``(B,)``.
-        settled: tells which problems need no more work.
+        scale: mean widths of the action bounds, ``(B,)``.
+        settled: function that tells which problems need no more work.
     """
     found = Best(
         start.clone(), torch.full_like(scale, -torch.inf), torch.full_like(scale, torch.inf)
@@ -82,8 +82,8 @@ def maximize_slack_by_cuts(
 
 def _slacks(sets: Sequence[ConstraintSet], index: Tensor, batch: int, action: Tensor) -> Tensor:
     """Return slacks ``(B, len(sets))``."""
-    chosen = [each.select(torch.Size([batch]), index) for each in sets]
-    return torch.stack([each.slack(action) for each in chosen], -1)
+    chosen = [s.select(torch.Size([batch]), index) for s in sets]
+    return torch.stack([s.slack(action) for s in chosen], -1)
 
 
 def _linearized(
@@ -91,10 +91,10 @@ def _linearized(
 ) -> tuple[Tensor, Tensor]:
     """Return slacks ``(B, len(sets))`` and their gradients ``(B, len(sets), d)``."""
     slacks, gradients = [], []
-    for each in sets:
+    for constraint_set in sets:
         with torch.enable_grad():
             at = action.detach().requires_grad_()
-            slack = each.select(torch.Size([batch]), index).slack(at)
+            slack = constraint_set.select(torch.Size([batch]), index).slack(at)
             gradients.append(torch.autograd.grad(slack.sum(), at)[0])
         slacks.append(slack.detach())
     return torch.stack(slacks, -1), torch.stack(gradients, -2)

@@ -1,4 +1,4 @@
-"""How deep inside every set an anchor lies at least: the resolution of all that is decided."""
+"""The least depth of an anchor in every set, which is the resolution of all decisions."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ radius of 8.8e-5.
 """
 
 EROSIONS = 8.0
-"""The least slack of an anchor in a set, in erosions of that set: some are spent on rounding of the
-actions, of the anchor and of the amounts, in a set that relaxation may have made twice as large."""
+"""The least slack of an anchor in a set, in erosions of that set.
+
+Some are spent on rounding of the actions, of the anchor and of the amounts, in a set that
+relaxation may have made twice as large.
+"""
 
 
 def bounds_of(sets: Sequence[ConstraintSet]) -> Box:
@@ -32,14 +35,15 @@ def bounds_of(sets: Sequence[ConstraintSet]) -> Box:
     """
     bounds = next(iter(sets), None)
     if not isinstance(bounds, Box):
-        given = [type(each).__name__ for each in sets]
+        given = [type(constraint_set).__name__ for constraint_set in sets]
         raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-    for stage, each in enumerate(sets):
-        if not isinstance(each, ConstraintSet) or each.dim != bounds.dim:
-            of = f" of {each.dim} components" if isinstance(each, ConstraintSet) else ""
+    for stage, given_set in enumerate(sets):
+        if not isinstance(given_set, ConstraintSet) or given_set.dim != bounds.dim:
+            is_set = isinstance(given_set, ConstraintSet)
+            size = f" of {given_set.dim} components" if is_set else ""
             raise GeometryError(
                 f"sets[{stage}]: expected a ConstraintSet of actions with {bounds.dim} components, "
-                f"as the action bounds have, given {type(each).__name__}{of}"
+                f"as the action bounds have, given {type(given_set).__name__}{size}"
             )
     return bounds
 
@@ -56,9 +60,9 @@ def row_depths(sets: Sequence[ConstraintSet]) -> list[Tensor]:
     width is that of the action bounds, the erosion what `ConstraintSet.eroded` takes off the row.
 
     Args:
-        sets: the first are the action bounds.
+        sets: sets, the first of them the box of action bounds.
     """
     bounds = bounds_of(sets)
     least = (DEPTH * smallest_width(bounds)).unsqueeze(-1)
     magnitude = bounds.magnitude()
-    return [torch.maximum(EROSIONS * each.rounding(magnitude), least) for each in sets]
+    return [torch.maximum(EROSIONS * s.rounding(magnitude), least) for s in sets]

@@ -17,7 +17,7 @@ from torch import Tensor
 from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program
 
 MAX_ITERATIONS = 150
-"""Newton steps after which the best point so far must do; some 15 are usual, 50 rare."""
+"""The number of Newton steps after which the best point so far is taken; 15 are usual, 50 rare."""
 
 _GROWTH = 20.0
 _TRIALS = 6
@@ -46,8 +46,8 @@ def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Sett
     Args:
         problem: B problems in float64, with rows that bound the actions on all sides.
         start: points strictly inside of the inequalities of rate 0, ``(B, d)``.
-        scale: the mean widths of the bounds, ``(B,)``.
-        settled: tells which problems need no more work.
+        scale: mean widths of the bounds, ``(B,)``.
+        settled: function that tells which problems need no more work.
     """
     at = problem.start(start, scale)
     # The bounds' diagonal at most; outside of the bounds nothing is feasible.
@@ -66,7 +66,7 @@ def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Sett
                 return found
             problem, left = problem.select(undecided), left[undecided]
             lower, upper, action = lower[undecided], upper[undecided], action[undecided]
-            eta, at = eta[undecided], Point(*(each[undecided] for each in at))
+            eta, at = eta[undecided], Point(*(variable[undecided] for variable in at))
         distances = problem.distances(at)
         slack = at.slack + problem.gained(distances)
         action = torch.where((slack > lower).unsqueeze(-1), at.action, action)
@@ -97,7 +97,7 @@ def newton(problem: Program, at: Point, distances: Distances, eta: Tensor) -> tu
     Args:
         problem: B problems.
         at: strictly feasible points.
-        distances: of these points from the inequalities.
+        distances: distances of these points from the inequalities.
         eta: weights of t, ``(B,)``.
     """
     inverse = distances.rows.reciprocal().unsqueeze(-1)

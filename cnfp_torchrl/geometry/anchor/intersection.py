@@ -47,16 +47,16 @@ class Intersection:
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
         """
-        wide = [each.to(torch.float64) for each in sets]
+        wide = [s.to(torch.float64) for s in sets]
         bounds = wide[0]
         if not isinstance(bounds, Box) or not bool((bounds.high - bounds.low).isfinite().all()):
             raise GeometryError("sets[0]: expected a finite Box of action bounds")
-        for i, each in enumerate(wide):
-            for name, field in each.fields().items():
+        for i, constraint_set in enumerate(wide):
+            for name, field in constraint_set.fields().items():
                 if bool(field.isnan().any()):
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
         middle = (bounds.low + bounds.high) / 2
-        widths = tuple(int(each.row_slacks(middle).shape[-1]) for each in wide)
+        widths = tuple(int(s.row_slacks(middle).shape[-1]) for s in wide)
         program, described, plain = _described(wide, widths, near, len(middle))
         return cls(wide, widths, program, described, plain)
 
@@ -70,7 +70,7 @@ class Intersection:
     @property
     def convex(self) -> list[bool]:
         """Which of the sets are convex."""
-        return [type(each).part_near is ConstraintSet.part_near for each in self.sets]
+        return [type(s).part_near is ConstraintSet.part_near for s in self.sets]
 
     @property
     def bounds(self) -> Box:
@@ -87,15 +87,15 @@ class Intersection:
     def row_slacks(self, action: Tensor) -> Tensor:
         """Return the slacks of all rows, ``(B, R)``."""
         slacks = [
-            each.row_slacks(action).expand(len(action), width)
-            for each, width in zip(self.sets, self.widths, strict=True)
+            constraint_set.row_slacks(action).expand(len(action), width)
+            for constraint_set, width in zip(self.sets, self.widths, strict=True)
         ]
         return torch.cat(slacks, -1)
 
     def select(self, index: Tensor) -> Self:
         """Return some of the B intersections."""
         shape = torch.Size([len(self.program.rows)])
-        sets = [each.select(shape, index) for each in self.sets]
+        sets = [s.select(shape, index) for s in self.sets]
         return type(self)(sets, self.widths, self.program.select(index), self.described, self.plain)
 
     def maximize(
@@ -136,7 +136,7 @@ def _described(
     sets: Sequence[ConstraintSet], widths: Sequence[int], near: Tensor | None, batch: int
 ) -> tuple[Program, Tensor, tuple[int, ...]]:
     """Return the program, the row of each of its inequalities, and the sets left out of it."""
-    parts = [each.superlevel() if near is None else each.part_near(near) for each in sets]
+    parts = [s.superlevel() if near is None else s.part_near(near) for s in sets]
     known = [part for part in parts if part is not None]
     owners: dict[type[Superlevel], list[int]] = {Rows: [], Cone: [], KinkedSum: []}
     first = 0

@@ -28,7 +28,7 @@ from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 LEEWAY = 1e-3
-"""By how much relaxed rows give way beyond the least amount, as a share of the bounds' width.
+"""The amount by which rows are relaxed beyond the least one, as a share of the bounds' width.
 
 A region only as wide as the depth would leave a policy no room. In relaxed states of 2 and 6
 dimensions, from 1e-5 to 1e-2, the gradient of the log-density in the latent stays the same (medians
@@ -44,10 +44,10 @@ is left.
 def lexicographic_anchor(
     sets: Sequence[ConstraintSet], candidate: Tensor | None = None, leeway: float = LEEWAY
 ) -> Anchored:
-    """Find which sets hold in each state, by how much others give way, and the anchor.
+    """Find which sets hold in each state, by how much the others are relaxed, and the anchor.
 
-    Cheap attempts first (`attempt_anchor`); the certified search takes the states that they leave
-    undecided. A function of the states alone: of batches it does not depend what is found.
+    Cheap attempts come first (`attempt_anchor`); the certified search takes the states that they
+    leave undecided. What is found in a state does not depend on the batch that it is in.
 
     A convex set is relaxed only on a certified upper bound of its slack, by an amount within 2 % of
     its depth of the least one, plus the leeway. Of non-convex sets convex parts are tried: those of
@@ -58,7 +58,7 @@ def lexicographic_anchor(
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
             which always holds, and the last has the highest priority.
         candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        leeway: by how much relaxed rows give way beyond the least amount, as a share of the bounds'
+        leeway: amount by which rows are relaxed beyond the least one, as a share of the bounds'
             smallest width; positive.
 
     Raises:
@@ -74,17 +74,17 @@ def lexicographic_anchor(
     shape, dim = found.decided.shape, found.anchor.shape[-1]
     anchor = found.anchor.reshape(-1, dim)
     active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
-    relaxation = [each.new_zeros(*shape, each.shape[-1]) for each in depths]
+    relaxation = [depth.new_zeros(*shape, depth.shape[-1]) for depth in depths]
     left = (~found.decided).flatten().nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
-        sets = [each.select(shape, left) for each in sets]
-        depths = [_flat(each, shape)[left] for each in depths]
+        sets = [s.select(shape, left) for s in sets]
+        depths = [_flat(depth, shape)[left] for depth in depths]
         found = refined_attempt(sets, depths, found.select(left))
         anchor = anchor.index_copy(0, left, found.anchor)
         hard = (~found.decided).nonzero().squeeze(-1)
-        sets = [each.select(found.decided.shape, hard) for each in sets]
-        depths = [each[hard] for each in depths]
+        sets = [s.select(found.decided.shape, hard) for s in sets]
+        depths = [depth[hard] for depth in depths]
         found, left = found.select(hard), left[hard]
     if len(left):
         margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
@@ -93,24 +93,24 @@ def lexicographic_anchor(
         active.view(-1, len(sets)).index_copy_(0, left, searched.active)
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
         up = 1 + 4 * torch.finfo(anchor.dtype).eps
-        for each, rows in zip(relaxation, (up * rows for rows in searched.relaxation), strict=True):
-            each.view(-1, each.shape[-1]).index_copy_(0, left, rows.to(each))
+        for amount, found_amount in zip(relaxation, searched.relaxation, strict=True):
+            flat = amount.view(-1, amount.shape[-1])
+            flat.index_copy_(0, left, (up * found_amount).to(amount))
     return Anchored(anchor.view(*shape, dim), active, tuple(relaxation))
 
 
 def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:
     """Return the relaxation that a set has where it can just be touched, ``(*batch, K + 1)``.
 
-    An equality stated as two half-spaces, a point, a bound of 0: sets without interior are relaxed
-    by this much at most, and no action need leave them by more than that. A larger relaxation says
-    that a constraint could not be had.
+    Sets without interior, such as a point or an equality stated as two half-spaces, are relaxed by
+    this much at most. A larger relaxation means that a constraint could not hold.
 
     Args:
-        sets: as in `lexicographic_anchor`.
-        leeway: the same.
+        sets: sets in order of application, as in `lexicographic_anchor`.
+        leeway: leeway, as in `lexicographic_anchor`.
     """
     more = leeway * smallest_width(bounds_of(sets))
-    floors = [(1 + 2 * PRECISION) * each.amax(-1) + more for each in row_depths(sets)]
+    floors = [(1 + 2 * PRECISION) * depth.amax(-1) + more for depth in row_depths(sets)]
     return torch.stack(torch.broadcast_tensors(*floors), -1)
 
 
@@ -123,8 +123,8 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
 
     Args:
         sets: sets of batch shape ``(B,)``, the first a finite box.
-        share: the share of the best slack that will do, below 1; where the best slack is negative
-            the one found is at most that much lower.
+        share: share of the best slack that is enough, below 1; where the best slack is negative,
+            the one found is lower by at most ``1 - share`` of it.
 
     Returns:
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.

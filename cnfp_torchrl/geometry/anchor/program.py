@@ -68,8 +68,8 @@ class Program:
         """Stack descriptions, each with batch shape ``(B,)``: all rows, all cones, all sums.
 
         Args:
-            parts: one description for each set, at least one of them with rows.
-            batch: B.
+            parts: descriptions, one for each set, at least one of them with rows.
+            batch: number B of problems.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
@@ -109,12 +109,12 @@ class Program:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
-            required: slacks ``(B, M)`` of all inequalities, in their order.
-            trial: which of them exceed it by t, 1 or 0; the others need no more than the required.
-            counts: which of them count at all, 1 or 0.
+            required: slacks ``(B, M)`` required of all inequalities, in their order.
+            trial: flags of those that exceed it by t, 1 or 0; the others need no more than it.
+            counts: flags of those that count at all, 1 or 0.
         """
         sizes = [self.row_rates.shape[-1], self.cone_rates.shape[-1], self.sum_rates.shape[-1]]
-        needs, trials, on = (each.split(sizes, -1) for each in (required, trial, counts))
+        needs, trials, on = (rows.split(sizes, -1) for rows in (required, trial, counts))
         shifted = replace(
             self,
             row_offsets=self.row_offsets - self.row_rates * needs[0],
@@ -124,7 +124,7 @@ class Program:
             sum_sizes=self.sum_sizes - self.sum_rates * needs[2],
             sum_rates=self.sum_rates * trials[2],
         )
-        return shifted._where(*(each > 0 for each in on))
+        return shifted._where(*(flags > 0 for flags in on))
 
     def _where(self, rows: Tensor, cones: Tensor, sums: Tensor) -> Self:
         """Return the problems of the inequalities that count."""

@@ -22,22 +22,22 @@ SHARE = 0.6
 """The share of the best slack that a searched anchor has."""
 
 PRECISION = 0.02
-"""How close an amount comes to the least one, as a share of the depth."""
+"""The largest distance of an amount from the least one, as a share of the depth."""
 
 _FAR = 10.0
-"""A row whose depth is that many diagonals of the bounds cannot tell actions within them apart."""
+"""The depth, in diagonals of the bounds, from which on a row cannot tell actions apart."""
 
 
 class Anchored(NamedTuple):
-    """The anchors of some states, and what the sets had to give way by.
+    """The anchors of some states, which sets hold there, and by how much others are relaxed.
 
     A set holds (active, relaxation 0), is relaxed (not active, relaxation finite) or dropped (not
     active, infinite: only families that cannot be inflated, `ConstraintSet.can_be_inflated`).
 
     Attributes:
         anchor: points well inside the region, ``(*batch, d)``.
-        active: which sets hold as stated, boolean ``(*batch, K + 1)``.
-        relaxation: by how much each row of each set was widened, ``(*batch, m)`` a set.
+        active: flags of the sets that hold as stated, boolean ``(*batch, K + 1)``.
+        relaxation: amounts by which the m rows of each set are widened, ``(*batch, m)`` for each.
     """
 
     anchor: Tensor
@@ -50,15 +50,15 @@ class Anchored(NamedTuple):
 
 
 class Search:
-    """The rule for B states, by the certified method.
+    """The lexicographic rule for B states, by the certified method.
 
-    Of each row of all R it is known what depth it keeps, by how much it is relaxed so far, and
-    whether it counts yet; of each state a point strictly inside of what counts.
+    It keeps for each of the R rows of all sets its depth, its relaxation so far, and whether it
+    counts yet, and for each state a point strictly inside of the rows that count.
 
     Args:
-        everything: the sets of the states.
-        depth: ``(B, R)``.
-        leeway: ``(B,)``.
+        everything: sets of the states.
+        depth: depths of all rows, ``(B, R)``.
+        leeway: amounts of relaxation beyond the least ones, ``(B,)``.
     """
 
     def __init__(self, everything: Intersection, depth: Tensor, leeway: Tensor) -> None:
@@ -172,8 +172,8 @@ class Search:
         amounts = self.relaxation.split(self.everything.widths, -1)
         depths = self.depth.split(self.everything.widths, -1)
         sets = [self.everything.sets[0]] + [
-            each.inflated(amount) if each.can_be_inflated() else each
-            for each, amount in zip(self.everything.sets[k:], amounts[k:], strict=True)
+            s.inflated(amount) if s.can_be_inflated() else s
+            for s, amount in zip(self.everything.sets[k:], amounts[k:], strict=True)
         ]
         bounds = self.everything.bounds
         upper = (bounds.high - bounds.low).amin(-1) / 2
@@ -226,7 +226,7 @@ class Search:
         """Move to points well inside of some rows where there are such, and tell where.
 
         Args:
-            rows: with the bounds' among them, boolean ``(B, R)``.
+            rows: flags of the rows, those of the bounds among them, boolean ``(B, R)``.
         """
         found = self._roomiest(self.everything, rows)
         fits = found.slack >= 0
@@ -254,9 +254,9 @@ class Search:
         """Find points with most slack beyond what rows require, or that there are none.
 
         Args:
-            part: of the states at the index.
-            rows: that count, boolean ``(B, R)``.
-            index: of the states; None means all.
+            part: sets of the states at the index.
+            rows: flags of the rows that count, boolean ``(B, R)``.
+            index: indices of the states; None means all.
         """
         index = torch.arange(len(rows), device=rows.device) if index is None else index
         chosen = rows[index]
@@ -277,7 +277,7 @@ class Search:
             [rows[:, self.everything.rows_of(k)].any(-1) for k in range(len(sets))], -1
         )
         for axis in torch.eye(point.shape[-1], dtype=point.dtype, device=point.device):
-            for way in (axis.expand_as(point), -axis.expand_as(point)):
-                gauges = torch.stack([each.gauge(way, point) for each in sets], -1)
+            for direction in (axis.expand_as(point), -axis.expand_as(point)):
+                gauges = torch.stack([s.gauge(direction, point) for s in sets], -1)
                 gauge = torch.where(counts, gauges, 0.0).amax(-1, keepdim=True)
-                yield point + way * (0.5 / gauge)
+                yield point + direction * (0.5 / gauge)

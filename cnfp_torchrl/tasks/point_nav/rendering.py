@@ -147,6 +147,6 @@ class _Canvas:
 
 def _mix(color: str, other: str, share: float) -> tuple[int, int, int]:
     """Return ``share`` of the first color and the rest of the second one."""
-    mine, theirs = (tuple(int(each[i : i + 2], 16) for i in (1, 3, 5)) for each in (color, other))
-    r, g, b = (round(share * a + (1 - share) * c) for a, c in zip(mine, theirs, strict=True))
+    first, second = (tuple(bytes.fromhex(text[1:])) for text in (color, other))
+    r, g, b = (round(share * a + (1 - share) * c) for a, c in zip(first, second, strict=True))
     return r, g, b

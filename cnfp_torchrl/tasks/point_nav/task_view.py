@@ -48,8 +48,8 @@ class PointNavView(TaskView):
     """
 
     def __init__(self, layout: Layout, env: EnvBase) -> None:
-        known = appended_transforms(env)
-        self._geometries = [each for each in known if isinstance(each, PointNavGeometry)]
+        appended = appended_transforms(env)
+        self._geometries = [t for t in appended if isinstance(t, PointNavGeometry)]
         self._key = str(self._geometries[0].in_keys[0]) if self._geometries else "observation"
         self._layout = layout
         self.map = _map(layout)

@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import TaskView, find_task_view
+from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
 from cnfp_torchrl.visual.colors import INK, constraint_colors
 from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.figures.map import (
@@ -82,8 +83,8 @@ def record_episodes(
     states = torch.cat([rollout.select(*shared), after.select(*shared)[:, -1:]], dim=1)
     positions, goals = view.position(states), view.goal(states)
     levels = view.series_values(states)[view.series[0].name] if view.series else None
-    rewards = after["reward"].squeeze(-1)
-    costs = after.get("cost", rewards.new_zeros((*rewards.shape, 0)))
+    rewards = after[REWARD_KEY].squeeze(-1)
+    costs = after.get(COST_KEY, rewards.new_zeros((*rewards.shape, 0)))
     return [
         Episode(
             positions=positions[i].numpy(),

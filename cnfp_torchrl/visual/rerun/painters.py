@@ -13,6 +13,7 @@ from rerun.components import ImageFormat
 from tensordict import TensorDictBase
 
 from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Shape
+from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
 from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.rerun import entities, style
@@ -315,10 +316,10 @@ class SeriesPainter:
 
     def follow(self, transition: TensorDictBase) -> None:
         """Add a step to the sums; of every step, logged or not."""
-        reward = transition.get(("next", "reward"), None)
+        reward = transition.get(("next", REWARD_KEY), None)
         self._reward = None if reward is None else float(reward.sum())
         self._return += self._reward or 0.0
-        cost = transition.get(("next", "cost"), None)
+        cost = transition.get(("next", COST_KEY), None)
         if cost is not None and self._costs:
             self._costs = [a + b for a, b in zip(self._costs, cost.tolist(), strict=True)]
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.rerun import entities
@@ -91,8 +92,8 @@ class FlowStream:
         self._checked: list[NestedKey] = [
             head.action_key,
             *head.parameter_keys,
-            ("next", "reward"),
-            ("next", "cost"),
+            ("next", REWARD_KEY),
+            ("next", COST_KEY),
         ]
         plane = setting.view.map
         self._map = None if plane is None else MapPainter(stream, setting, plane)
