@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -61,12 +61,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
     Raises:
         ValueError: for a bad or reserved name, a margin below 0 or a resolution that is no step.
         TypeError: for `in_keys` that are a string, and where `constraint_set` returns no set.
-        GeometryError: for input that is not finite, for a set that is not one, for a second family
-            and for a family that breaks the contract of `ConstraintSet`, naming key or constraint
-            and field, and the batch index.
+        GeometryError: for input that is not finite, for a set that is not one, for a second family,
+            for a family that breaks the contract of `ConstraintSet` and, at the first batch, for
+            sets that depend on other states than their own, naming key or constraint and field,
+            and the batch index.
     """
 
     _family: type[ConstraintSet] | None = None
+    _is_compared = False
 
     def __init__(
         self,
@@ -230,7 +232,11 @@ class GeometryTransform(Transform, ConstraintPublisher):
         for key in self.in_keys:
             self._refuse_what_is_not_finite(key, next_tensordict.get(key))
         allowed = self._validated(self.checked_set(next_tensordict))
-        for key, value in self._entries(next_tensordict, allowed).items():
+        entries = self._entries(next_tensordict, allowed)
+        if not self._is_compared and next_tensordict.numel() > 1:
+            self._refuse_sets_of_other_states(next_tensordict, entries)
+            self._is_compared = True
+        for key, value in entries.items():
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -317,6 +323,32 @@ class GeometryTransform(Transform, ConstraintPublisher):
                     f"set whatever the batch, given {shape} for 2 states and {shapes[1][field]} "
                     "for 3; put the batch first, and then what belongs to one set: a single "
                     "half-space for each state has normals (*batch, 1, d) and offsets (*batch, 1)"
+                )
+
+    def _refuse_sets_of_other_states(
+        self, states: TensorDictBase, entries: Mapping[tuple[str, ...], Tensor]
+    ) -> None:
+        """Refuse, at the first batch of states, sets that are not those of the states alone.
+
+        ``observation[0, 3:]`` in place of ``observation[..., 3:]`` has the shape of a set that all
+        states share, and is the first state's. Compared for the last state, up to the rounding of
+        other batch sizes.
+        """
+        last = states.reshape(-1)[-1:]
+        allowed = self._validated(self.checked_set(last))
+        if allowed.batch_shape.numel() > 1:
+            # Limits of its own for each environment of this batch, which no state tells.
+            return
+        alone = self._entries(last, allowed)
+        for key, value in entries.items():
+            batched, single = value.flatten(0, states.ndim - 1)[-1], alone[key][0]
+            atol = 1e-5 * float(batched.masked_fill(batched.isinf(), 0).abs().amax())
+            if not torch.allclose(single, batched, rtol=1e-3, atol=atol):
+                raise GeometryError(
+                    f"constraint '{self.name}', {key[-1]!r}: expected that of a state whatever "
+                    f"other states are beside it, given {batched.tolist()} for the last of "
+                    f"{states.numel()} states and {single.tolist()} for the same state alone; "
+                    "compute it from each state's own entries, such as observation[..., 3:]"
                 )
 
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:

@@ -326,3 +326,30 @@ def test_a_safe_action_is_one_for_each_state(answer: object, given: str) -> None
     message = r"'unsafe', Unsafe.safe_action: expected None or a tensor of shape \(3, 2\), given "
     with pytest.raises(GeometryError, match=message + given):
         constrain_env(PointNavEnv([3]), Unsafe("unsafe"))
+
+
+class FirstStatesLimit(GeometryTransform):
+    """Takes the first state's entry for all: an index where an ellipsis was meant."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        goal = tensordict["observation"].reshape(-1, 5)[0, 3:]
+        return Ball(0.1 * goal, torch.ones(()), validate_args=False)
+
+
+class MeanLimit(GeometryTransform):
+    """Depends on all states of the batch."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        goal = tensordict["observation"][..., 3:]
+        center = goal - goal.reshape(-1, 2).mean(0)
+        return Ball(center, torch.ones_like(goal[..., 0]), validate_args=False)
+
+
+@pytest.mark.parametrize("geometry", [FirstStatesLimit, MeanLimit])
+@pytest.mark.parametrize("batch", [(2,), (3, 4)])
+def test_a_set_is_that_of_its_own_state(
+    geometry: type[GeometryTransform], batch: tuple[int, ...]
+) -> None:
+    env = constrain_env(PointNavEnv(batch), geometry("speed"))
+    with pytest.raises(GeometryError, match=r"'speed', 'center'.*state alone"):
+        env.reset()
