@@ -339,13 +339,13 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if allowed.batch_shape.numel() > 1:
             # Limits of its own for each environment of this batch, which no state tells.
             return
-        alone = self._entries(last, allowed)
-        for key, value in entries.items():
-            batched, single = value.flatten(0, states.ndim - 1)[-1], alone[key][0]
+        for field, value in allowed.fields().items():
+            batched = entries[field_key(self.name, field)].flatten(0, states.ndim - 1)[-1]
+            single = value.expand(1, *batched.shape)[0]
             atol = 1e-5 * float(batched.masked_fill(batched.isinf(), 0).abs().amax())
             if not torch.allclose(single, batched, rtol=1e-3, atol=atol):
                 raise GeometryError(
-                    f"constraint '{self.name}', {key[-1]!r}: expected that of a state whatever "
+                    f"constraint '{self.name}', field '{field}': expected that of a state whatever "
                     f"other states are beside it, given {batched.tolist()} for the last of "
                     f"{states.numel()} states and {single.tolist()} for the same state alone; "
                     "compute it from each state's own entries, such as observation[..., 3:]"

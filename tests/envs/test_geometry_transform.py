@@ -351,5 +351,5 @@ def test_a_set_is_that_of_its_own_state(
     geometry: type[GeometryTransform], batch: tuple[int, ...]
 ) -> None:
     env = constrain_env(PointNavEnv(batch), geometry("speed"))
-    with pytest.raises(GeometryError, match=r"'speed', 'center'.*state alone"):
+    with pytest.raises(GeometryError, match=r"'speed', field 'center'.*state alone"):
         env.reset()
