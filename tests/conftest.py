@@ -1,7 +1,9 @@
 """What all tests share: one thread per worker, and the same random numbers for each test."""
 
+import logging
 import os
 import random
+from collections.abc import Iterator
 
 # Read when NumPy is first imported; each worker has one core to itself.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -14,6 +16,16 @@ import torch
 def pytest_configure() -> None:
     # pytest-xdist starts one worker per core; more threads than that only wait for each other.
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before() -> Iterator[None]:
+    """Remove handlers that a test left behind, as Hydra does: what they write to is closed."""
+    root = logging.getLogger()
+    before = list(root.handlers)
+    yield
+    for handler in set(root.handlers) - set(before):
+        root.removeHandler(handler)
 
 
 @pytest.fixture(autouse=True)

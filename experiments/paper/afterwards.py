@@ -91,7 +91,7 @@ def evaluation(folder: RunFolder, config: DictConfig) -> Evaluation:
 
     def outcome(deterministic: bool) -> Outcome:
         result = evaluate_seeded(env, actor, settings, deterministic=deterministic)
-        return Outcome(**result.report(score))
+        return Outcome.of(result.report(score))
 
     return Evaluation(stochastic=outcome(False), deterministic=outcome(True))
 

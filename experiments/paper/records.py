@@ -88,6 +88,11 @@ class Outcome(Kept):
     episodes: Count
     steps: Count
 
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Self:
+        """Return what is kept of an evaluation's report, which says more."""
+        return cls(**{name: report[name] for name in cls.model_fields})
+
 
 class Evaluation(Kept):
     """What a trained policy did with drawn actions, and with the mode of its distribution."""

@@ -30,7 +30,14 @@ from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.train import train
 from cnfp_torchrl.visual.figures import read_scalars
 from experiments.paper.afterwards import evaluate_afterwards
-from experiments.paper.records import Evaluation, Record, Series, differences, record_path
+from experiments.paper.records import (
+    Evaluation,
+    Outcome,
+    Record,
+    Series,
+    differences,
+    record_path,
+)
 
 PRESENTATION = ("figures", "hydra", "logger", "visual")
 """Sections of the training configuration that change nothing in a result; not recorded."""
@@ -129,7 +136,9 @@ def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
             for name, (steps, values) in curves.items()
         },
         training_violations=summary["training_violations"],
-        evaluation=Evaluation.model_validate(summary["evaluation"]),
+        evaluation=Evaluation(
+            **{name: Outcome.of(report) for name, report in summary["evaluation"].items()}
+        ),
         afterwards=evaluate_afterwards(folder),
     )
 

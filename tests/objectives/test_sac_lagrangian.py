@@ -404,8 +404,12 @@ def tiny_run(folder: Path, *overrides: str) -> dict[str, Any]:
 
 
 def form(value: Any) -> Any:
+    """Return the keys and types of a summary, but for how constraints gave way.
+
+    Without an anchor nobody finds out whether a constraint can hold, and there is nothing to tell.
+    """
     if isinstance(value, dict):
-        return {key: form(each) for key, each in value.items()}
+        return {key: form(entry) for key, entry in value.items() if key != "constraints"}
     return type(value).__name__
 
 
