@@ -34,6 +34,9 @@ class ConstrainedSACLoss(BatchedSACLoss):
             ``state_action_value``.
         entropy: The entropy that is rewarded, ``reference`` or ``action``.
         gamma: The discount factor, in [0, 1).
+        max_alpha: The largest weight of the entropy. Where a constraint is relaxed, the allowed
+            region is as thin as the leeway, and no policy has the target entropy of its actions
+            there: the weight would grow without end, and the gradients with it.
         kwargs: Further options of `torchrl.objectives.SACLoss`.
 
     Raises:
@@ -49,6 +52,7 @@ class ConstrainedSACLoss(BatchedSACLoss):
         *,
         entropy: Entropy = "reference",
         gamma: float = 0.99,
+        max_alpha: float = 10.0,
         **kwargs: Any,
     ) -> None:
         if entropy not in ("reference", "action"):
@@ -61,7 +65,7 @@ class ConstrainedSACLoss(BatchedSACLoss):
                 f"one that projects them, given {entropy!r}"
             )
         scored = with_reference_entropy(actor_network) if entropy == "reference" else actor_network
-        super().__init__(scored, qvalue_network, **kwargs)
+        super().__init__(scored, qvalue_network, max_alpha=max_alpha, **kwargs)
         head = actor_modules(actor_network)[-1]
         if kwargs.get("target_entropy", "auto") == "auto" and isinstance(
             head, ConstrainedFlowModule

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.envs import NOTHING, TaskView
+from cnfp_torchrl.text_table import text_table
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 Effect = Literal["permissive", "restrictive", "relaxed", "dropped", "broken"]
@@ -96,13 +97,8 @@ class Explanation:
 
     def text(self) -> str:
         """Return it as plain text with an aligned table, for a terminal."""
-        table = self._table()
-        widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in table
-        ]
-        parts = [self._headline(), self.situation, "\n".join(lines), "\n".join(self._sentences(""))]
+        table = text_table(self._table())
+        parts = [self._headline(), self.situation, table, "\n".join(self._sentences(""))]
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def _headline(self) -> str:
