@@ -20,12 +20,13 @@ def pytest_configure() -> None:
 
 @pytest.fixture(autouse=True)
 def logging_as_before() -> Iterator[None]:
-    """Remove handlers that a test left behind, as Hydra does: what they write to is closed."""
+    """Close handlers that a test left behind, as Hydra does: they write to its output alone."""
     root = logging.getLogger()
     before = list(root.handlers)
     yield
     for handler in set(root.handlers) - set(before):
         root.removeHandler(handler)
+        handler.close()
 
 
 @pytest.fixture(autouse=True)
