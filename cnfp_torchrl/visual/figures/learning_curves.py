@@ -22,6 +22,14 @@ RETURN, VIOLATIONS = "train/return", "violations/"
 TIMES = ("train/steps_per_second", "train/seconds", "train/processor_seconds")
 """Of the machine, not of learning: not drawn."""
 
+RELAXATIONS = {
+    "relaxed/": "share of steps relaxed",
+    "dropped/": "share of steps dropped",
+    "relaxation/": "largest relaxation (units of slack)",
+    "mean_relaxation/": "mean relaxation (units of slack)",
+}
+"""What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
+
 _WORDS = {"qvalue": "critic", "alpha": "α"}
 _TITLES = {"alpha": "entropy coefficient α", "entropy": "policy entropy (nats)"}
 _COLUMNS = 4
@@ -58,7 +66,8 @@ def learning_curves(
 ) -> Figure:
     """Draw return, cumulative violations by constraint, and whatever else was logged of learning.
 
-    What was not logged is said in its panel; a run without any scalars gives a figure that says so.
+    How constraints gave way is drawn where one did. What was not logged is said in its panel; a run
+    without any scalars gives a figure that says so.
 
     Args:
         curves: steps and values by name, see `read_scalars`.
@@ -71,13 +80,19 @@ def learning_curves(
             "This run logged no scalars that can be drawn.\n"
             "Train with logger=csv or logger=csv_tensorboard to see its curves here.",
         )
-    counted = {n.removeprefix(VIOLATIONS): c for n, c in curves.items() if n.startswith(VIOLATIONS)}
+    counted = _by_constraint(curves, VIOLATIONS)
+    relaxations = {title: _by_constraint(curves, prefix) for prefix, title in RELAXATIONS.items()}
+    relaxations = {
+        title: group
+        for title, group in relaxations.items()
+        if any(values.any() for _, values in group.values())
+    }
     others = {
         name: curve
         for name, curve in curves.items()
-        if name not in (RETURN, *TIMES) and not name.startswith(VIOLATIONS)
+        if name not in (RETURN, *TIMES) and not name.startswith((VIOLATIONS, *RELAXATIONS))
     }
-    panels = 2 + len(others)
+    panels = 2 + len(relaxations) + len(others)
     rows = -(-panels // _COLUMNS)
     columns = -(-panels // rows)
     last = max(float(steps.max()) for steps, _ in curves.values())
@@ -86,8 +101,13 @@ def learning_curves(
         figure.suptitle(title)
         axes = [figure.add_subplot(rows, columns, 1 + i) for i in range(panels)]
         _draw_return(axes[0], curves.get(RETURN))
-        _draw_violations(axes[1], counted, dict(colors or constraint_colors(counted)))
-        for panel, (name, curve) in zip(axes[2:], others.items(), strict=True):
+        named = {name for group in (counted, *relaxations.values()) for name in group}
+        colors = dict(colors or constraint_colors(sorted(named)))
+        _draw_violations(axes[1], counted, colors)
+        for panel, (heading, group) in zip(axes[2:], relaxations.items(), strict=False):
+            panel.set_title(heading)
+            _draw_by_constraint(panel, group, colors, "{:.3g}")
+        for panel, (name, curve) in zip(axes[2 + len(relaxations) :], others.items(), strict=True):
             panel.set_title(_title(name))
             _plot(panel, curve)
         for panel in axes:
@@ -120,15 +140,25 @@ def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[s
     if not counted:
         say(axes, "none counted")
         return
-    # Curves that coincide, as at exactly 0, all stay visible: the first is wide, the last is thin.
-    widths = 1.4 + 1.4 * np.arange(len(counted))[::-1]
-    for (name, (steps, values)), width in zip(counted.items(), widths, strict=True):
-        label = f"{name}: {values[-1]:,.0f}"
-        axes.plot(steps, values, color=colors[name], linewidth=width, label=label)
+    _draw_by_constraint(axes, counted, colors, "{:,.0f}")
     highest = max(float(values.max()) for _, values in counted.values())
     axes.set_ylim(-0.04 * max(highest, 1), 1.05 * max(highest, 1))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+def _draw_by_constraint(
+    axes: Axes, curves: Mapping[str, Curve], colors: Mapping[str, str], form: str
+) -> None:
+    # Curves that coincide, as at exactly 0, all stay visible: the first is wide, the last is thin.
+    widths = 1.4 + 1.4 * np.arange(len(curves))[::-1]
+    for (name, (steps, values)), width in zip(curves.items(), widths, strict=True):
+        label = f"{name}: {form.format(values[-1])}"
+        axes.plot(steps, values, color=colors[name], linewidth=width, label=label)
     axes.legend(loc="upper left")
+
+
+def _by_constraint(curves: Mapping[str, Curve], prefix: str) -> dict[str, Curve]:
+    return {n.removeprefix(prefix): curve for n, curve in curves.items() if n.startswith(prefix)}
 
 
 def _plot(axes: Axes, curve: Curve) -> None:

@@ -110,3 +110,18 @@ def test_single_entry_is_visible() -> None:
     figure = learning_curves({"train/return": (np.array([5.0]), np.array([1.0]))})
     (line,) = figure.axes[0].lines
     assert line.get_marker() == "o"
+
+
+def test_how_constraints_gave_way_is_one_panel_each_where_they_did() -> None:
+    steps = np.array([400.0, 800.0])
+    groups = ("relaxed", "dropped", "relaxation", "mean_relaxation")
+    names = [f"{group}/{name}" for group in groups for name in ("wall", "power")]
+    curves = {name: (steps, np.zeros(2)) for name in names}
+    assert len(learning_curves(curves).axes) == 2
+    curves["relaxed/wall"] = (steps, np.array([0.0, 0.25]))
+    panel = learning_curves(curves).axes[2]
+    assert "relaxed" in panel.get_title()
+    assert {text.get_text() for text in panel.get_legend().get_texts()} == {
+        "wall: 0.25",
+        "power: 0",
+    }
