@@ -54,6 +54,9 @@ LATENT_LOG_PROB_KEY = "latent_log_prob"
 COST_KEY = "cost"
 """Violations of one step, float32 ``(*batch, K)``; columns named by ``constraint_names``."""
 
+EXECUTED_ACTION_KEY = "executed_action"
+"""The allowed action that a free one was mapped to, by `cnfp_torchrl.envs.ConstrainedActions`."""
+
 EPISODE_COST_KEY = "episode_cost"
 """The sum of the costs of an episode so far, float32 ``(*batch, K)``."""
 

@@ -3,6 +3,7 @@
 from cnfp_torchrl.envs.action_guard import ActionGuard
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
 from cnfp_torchrl.envs.constrain_env import constrain_env
+from cnfp_torchrl.envs.constrained_actions import ConstrainedActions
 from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import PackedStates
@@ -30,6 +31,7 @@ __all__ = [
     "NOTHING",
     "ActionGuard",
     "Boxes",
+    "ConstrainedActions",
     "ConstraintAnchor",
     "ConstraintCost",
     "Discs",

@@ -21,7 +21,9 @@ from cnfp_torchrl.modules.flows import (
     RadialFlow,
     SquashFlow,
     UnconstrainedFlow,
+    resolve_safe_flow,
 )
+from cnfp_torchrl.modules.free_actions import FreeActionMap
 from cnfp_torchrl.modules.guard import (
     ConstraintViolationError,
     ExecutedActionGuard,
@@ -35,6 +37,7 @@ from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
+    changed_actions,
     constraint_bijectors,
 )
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
@@ -49,6 +52,7 @@ __all__ = [
     "ExecutedActionGuard",
     "Flow",
     "FlowMap",
+    "FreeActionMap",
     "GaugeFlow",
     "LatentActor",
     "LostDensityWarning",
@@ -63,6 +67,7 @@ __all__ = [
     "action_bounds",
     "actor_modules",
     "appended_transforms",
+    "changed_actions",
     "constrain",
     "constraint_bijectors",
     "flow_head",
@@ -75,6 +80,7 @@ __all__ = [
     "refuse_other_bounds",
     "refuse_relaxed",
     "refuse_violations",
+    "resolve_safe_flow",
     "split_at_latent",
     "with_reference_entropy",
 ]
