@@ -27,6 +27,7 @@ from cnfp_torchrl.modules.guard import (
     ExecutedActionGuard,
     RelaxedConstraintError,
     guarded,
+    refuse_misfit,
     refuse_relaxed,
     refuse_violations,
 )
@@ -70,6 +71,7 @@ __all__ = [
     "in_order",
     "make_constrained_actor",
     "refuse_exploration",
+    "refuse_misfit",
     "refuse_other_bounds",
     "refuse_relaxed",
     "refuse_violations",
