@@ -59,6 +59,11 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
     return bijectors
 
 
+def publishes_constraints(env: EnvBase) -> bool:
+    """Tell whether an environment's own transforms publish any constraint."""
+    return any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
+
+
 def appended_transforms(env: EnvBase) -> list[Transform]:
     """Return the transforms of an environment in order, none if it has none.
 

@@ -16,7 +16,6 @@ from cnfp_torchrl.configuration import require_settings
 from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import (
-    application_order,
     build_actor,
     build_environment,
     build_loss,
@@ -139,7 +138,7 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
             "steps": metrics.frames,
             "seconds": time.perf_counter() - started,
             "flow": type(flow_head(actor).flow).__name__,
-            "order": application_order(config),
+            "order": flow_head(actor).order,
             "seed": config.seed,
         }
         folder.save_summary(summary)
