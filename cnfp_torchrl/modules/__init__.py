@@ -21,7 +21,9 @@ from cnfp_torchrl.modules.flows import (
     RadialFlow,
     SquashFlow,
     UnconstrainedFlow,
+    resolve_safe_flow,
 )
+from cnfp_torchrl.modules.free_actions import FreeActionMap
 from cnfp_torchrl.modules.guard import (
     ConstraintViolationError,
     ExecutedActionGuard,
@@ -36,6 +38,7 @@ from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
+    changed_actions,
     constraint_bijectors,
     publishes_constraints,
 )
@@ -51,6 +54,7 @@ __all__ = [
     "ExecutedActionGuard",
     "Flow",
     "FlowMap",
+    "FreeActionMap",
     "GaugeFlow",
     "LatentActor",
     "LostDensityWarning",
@@ -65,6 +69,7 @@ __all__ = [
     "action_bounds",
     "actor_modules",
     "appended_transforms",
+    "changed_actions",
     "constrain",
     "constraint_bijectors",
     "flow_head",
@@ -79,6 +84,7 @@ __all__ = [
     "refuse_relaxed",
     "refuse_violations",
     "require_fit",
+    "resolve_safe_flow",
     "split_at_latent",
     "with_reference_entropy",
 ]
