@@ -12,6 +12,7 @@ constraints and actions of d components::
             row_relaxation  (*batch, m)      the same row by row, of sets that have rows
         safe_action  (*batch, d)         a candidate for the anchor, where a geometry knows one
         anchor       (*batch, d)         the point that gauges are taken about, by ConstraintAnchor
+    previous_action  (*batch, d)         the action that led to the state, by PreviousAction
     loc, scale       (*batch, d)         the Gaussian's parameters, by the network
     latent           (*batch, d)         what was drawn from it, where `split_at_latent` keeps it
     latent_log_prob  (*batch,)
@@ -47,6 +48,7 @@ CONSTRAINT_STATES = ("active", "relaxed", "dropped")
 LOC_KEY = "loc"
 SCALE_KEY = "scale"
 ACTION_KEY = "action"
+PREVIOUS_ACTION_KEY = "previous_action"
 LOG_DET_KEY = "log_det"
 LATENT_KEY = "latent"
 LATENT_LOG_PROB_KEY = "latent_log_prob"

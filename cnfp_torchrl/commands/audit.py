@@ -15,6 +15,7 @@ with needs_extra("train"):
     from omegaconf import DictConfig
 
     from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
+    from cnfp_torchrl.commands.paths import takes_any_path
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory, require_settings
     from cnfp_torchrl.training.agent import application_order, build_environment, load_actor
@@ -44,6 +45,7 @@ def audit_configured(config: DictConfig) -> AuditReport:
     )
 
 
+@takes_any_path
 @hydra.main(config_path=str(config_directory()), config_name="audit", version_base="1.3")
 def main(config: DictConfig) -> None:
     """Audit, print tables, write ``audit.json`` and ``audit.png``; exit with 3 for a flaw."""

@@ -8,6 +8,7 @@ from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
+from cnfp_torchrl.envs.previous_action import PreviousAction
 from cnfp_torchrl.envs.relaxation_watch import RelaxedEverywhereWarning
 from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
 from cnfp_torchrl.envs.task_view import (
@@ -41,6 +42,7 @@ __all__ = [
     "Marks",
     "PackedStates",
     "Polyline",
+    "PreviousAction",
     "RelaxedEverywhereWarning",
     "RewardPenalty",
     "SampledGeometry",

@@ -165,6 +165,14 @@ class ConstraintTally:
             rows = [self.published.index(name) for name in self._judged_published]
             yield "while", (states[:, rows] * columns.unsqueeze(-1)).sum(0)
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the sums."""
+        return dict(self._sums)
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on counting from sums that `state_dict` has returned."""
+        self._sums = dict(state)
+
     def counts(self) -> dict[str, ConstraintCounts]:
         """Return the counts by constraint: those that are judged first, then the others."""
         sums = {name: value.tolist() for name, value in self._sums.items()}
