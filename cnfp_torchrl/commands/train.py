@@ -14,9 +14,12 @@ with needs_extra("train"):
     from hydra.utils import instantiate
     from omegaconf import DictConfig, OmegaConf
 
+    from cnfp_torchrl.commands.paths import takes_any_path
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
+    from cnfp_torchrl.training.interruption import TrainingInterrupted
+    from cnfp_torchrl.training.resume import resumed_config
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
@@ -51,13 +54,23 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+@takes_any_path
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
 def main(config: DictConfig) -> float | None:
     """Train, draw the run's figures, print the summary, and return the score for sweeps."""
     with told_in_a_sentence():
-        folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
-        _save_hydra_files(folder, config)
-        summary = train(config, folder)
+        if config.resume is None:
+            folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
+            _save_hydra_files(folder, config)
+        else:
+            folder = RunFolder.resume(config.resume)
+            overrides = HydraConfig.get().overrides.task
+            config = resumed_config(folder, config, overrides, config.trusted)
+        try:
+            summary = train(config, folder, resume=folder.has_started)
+        except TrainingInterrupted as stop:
+            sys.stderr.write(f"{stop}\n")
+            sys.exit(128 + stop.number)
         if config.figures:
             instantiate(config.figures)(folder)
         sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
 from itertools import dropwhile
-from typing import Self
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
@@ -21,10 +23,15 @@ from cnfp_torchrl.modules import (
     action_bounds,
     appended_transforms,
     in_order,
+    refuse_misfit,
 )
 
 UNSEEN_STEPS = (FrameSkipTransform, MultiAction, NoopResetEnv)
 """TorchRL's transforms that take several steps of an environment for one of their own."""
+
+
+def _no_policy() -> None:
+    return None
 
 
 class ConstraintAnchor(Transform, ConstraintPublisher):
@@ -47,6 +54,10 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
     A constraint that gives way in each state of the first larger batches (of 256 states, or as many
     of smaller ones) is warned of, once (`RelaxedEverywhereWarning`).
 
+    A collector whose policy is a constrained actor for other action bounds, or one that explores
+    behind its flow, is refused when it is made: at its first reset. Not so where this transform
+    runs in the workers of a batched environment, which know no collector.
+
     Args:
         bijectors: One for each constraint; they know where the geometry lies.
         order: The constraints' names in order of application, the last with the highest priority;
@@ -55,8 +66,10 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             smallest width of the action bounds.
 
     Raises:
-        TypeError: when a bijector is none, or the order is a string.
-        ValueError: when an order does not name each constraint exactly once.
+        TypeError: when a bijector is none, or the order is a string; at a reset, for a collector's
+            policy that explores behind its flow.
+        ValueError: when an order does not name each constraint exactly once; at a reset, for a
+            collector's policy with other action bounds.
     """
 
     states_order = True
@@ -73,6 +86,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._watch = RelaxationWatch([each.name for each in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
+        # The last policy of a collector that was found to fit: each is examined once.
+        self._fitting: Callable[[], nn.Module | None] = _no_policy
 
     @property
     def leeway(self) -> float:
@@ -114,6 +129,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._refuse_unseen_steps()
+        self._refuse_misfit_of_collector()
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -157,6 +173,21 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                     f"{type(each).__name__}(...)), ...), whose geometry must hold for all steps of "
                     "one action"
                 )
+
+    def _refuse_misfit_of_collector(self) -> None:
+        """Refuse the policy of the collector that resets the environment, as it does when made.
+
+        Policies of other loops are out of sight.
+        """
+        collector = self.collector
+        policy = getattr(collector, "policy", None)
+        if not isinstance(policy, nn.Module) or policy is self._fitting():
+            return
+        refuse_misfit(policy, self._action_bounds(), self.parent.action_key)
+        self._fitting = weakref.ref(policy)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_fitting": _no_policy}
 
     def clone(self) -> Self:
         """Return a copy without environment, which keeps the action bounds of this one's."""

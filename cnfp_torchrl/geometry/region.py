@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import InitVar, dataclass
 from typing import Self
 
 import torch
@@ -13,49 +12,74 @@ from cnfp_torchrl.geometry.box import Box, require_action_bounds
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, broadcast_shape
 
 
-@dataclass(frozen=True, eq=False)
 class Region:
     """The intersection of the action bounds with K constraint sets, widened where they are relaxed.
 
     A set holds as stated where it is active. Elsewhere it is relaxed: each of its rows is widened
-    by its relaxation. Where that is infinite or unknown it is dropped: it restricts nothing.
+    by its relaxation. Where that is infinite or unknown it is dropped: it restricts nothing. A
+    region never changes.
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        anchor: points strictly inside all sets that are not dropped, ``(*batch, d)``.
+        anchor: points strictly inside all sets that are not dropped, ``(*batch, d)``; None where
+            none is known, which all that takes gauges refuses.
         active: flags of the sets that hold as stated, boolean ``(*batch, K + 1)``; None means all.
         relaxation: amounts by which the m rows of each set are widened, ``(*batch, m)`` for each
             set, 0 where it is active, as `lexicographic_anchor` finds them. None means that all
             sets that are not active are dropped.
+        validate_args: whether to check shapes; no values are read.
 
     Raises:
         GeometryError: when the first set is not a box, or dimensions or the number of relaxations
             differ.
     """
 
-    sets: tuple[ConstraintSet, ...]
-    anchor: Tensor
-    active: Tensor | None = None
-    relaxation: tuple[Tensor, ...] | None = None
-    validate_args: InitVar[bool] = True
+    def __init__(
+        self,
+        sets: Sequence[ConstraintSet],
+        anchor: Tensor | None = None,
+        active: Tensor | None = None,
+        relaxation: tuple[Tensor, ...] | None = None,
+        *,
+        validate_args: bool = True,
+    ) -> None:
+        self.sets = tuple(sets)
+        self.active = active
+        self.relaxation = relaxation
+        self._anchor = anchor
+        if validate_args:
+            self._validate()
 
-    def __post_init__(self, validate_args: bool) -> None:
-        if not validate_args:
-            return
+    def _validate(self) -> None:
         if not self.sets or not isinstance(self.sets[0], Box):
             given = [type(constraint_set).__name__ for constraint_set in self.sets]
             raise GeometryError(f"sets[0]: expected the Box of action bounds, given sets {given}")
-        dims = [*(constraint_set.dim for constraint_set in self.sets), int(self.anchor.shape[-1])]
-        if len(set(dims)) > 1:
+        dims = [constraint_set.dim for constraint_set in self.sets]
+        anchor_dim = dims[0] if self._anchor is None else int(self._anchor.shape[-1])
+        if len({*dims, anchor_dim}) > 1:
             raise GeometryError(
-                f"sets and anchor: expected one action dimension, given {dims[:-1]} and {dims[-1]}"
+                f"sets and anchor: expected one action dimension, given {dims} and {anchor_dim}"
             )
         if self.relaxation is not None and len(self.relaxation) != len(self.sets):
             raise GeometryError(
                 f"relaxation: expected amounts for each of the {len(self.sets)} sets, bounds "
                 f"included, given {len(self.relaxation)}"
             )
+
+    @property
+    def anchor(self) -> Tensor:
+        """The points strictly inside that gauges are taken about, ``(*batch, d)``.
+
+        Raises:
+            GeometryError: when none is known.
+        """
+        if self._anchor is None:
+            raise GeometryError(
+                "anchor: expected a point strictly inside all sets, which gauges are taken about, "
+                "given a region without one; find it with Region.build(sets)"
+            )
+        return self._anchor
 
     @property
     def bounds(self) -> Box:
@@ -67,10 +91,9 @@ class Region:
     @property
     def shape(self) -> torch.Size:
         """The shape ``(*batch, d)`` of the actions."""
-        active = () if self.active is None else (self.active.shape[:-1],)
+        others = [each.shape[:-1] for each in (self._anchor, self.active) if each is not None]
         sets = (constraint_set.batch_shape for constraint_set in self.sets)
-        batch = broadcast_shape(self.anchor.shape[:-1], *active, *sets)
-        return torch.Size((*batch, self.anchor.shape[-1]))
+        return torch.Size((*broadcast_shape(*others, *sets), self.bounds.dim))
 
     @property
     def is_active(self) -> Tensor:
@@ -78,18 +101,19 @@ class Region:
         if self.active is not None:
             return self.active
         everywhere = (*self.shape[:-1], len(self.sets))
-        return torch.ones(everywhere, dtype=torch.bool, device=self.anchor.device)
+        return torch.ones(everywhere, dtype=torch.bool, device=self.bounds.low.device)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
         """Return the region with sets and anchor in a dtype, all of it on a device."""
         sets = tuple(constraint_set.to(dtype, device) for constraint_set in self.sets)
+        anchor = None if self._anchor is None else self._anchor.to(device, dtype)
         active = None if self.active is None else self.active.to(device)
         amounts = self.relaxation
         if amounts is not None:
             amounts = tuple(amount.to(device, dtype) for amount in amounts)
-        return type(self)(sets, self.anchor.to(device, dtype), active, amounts, validate_args=False)
+        return type(self)(sets, anchor, active, amounts, validate_args=False)
 
     def widened(self) -> tuple[ConstraintSet, ...]:
         """Return the sets, each widened by its relaxation; dropped ones as they are."""
@@ -115,8 +139,8 @@ class Region:
             largest = [each.amax(-1).expand(shape) for each in self.relaxation]
             return torch.stack(largest, -1)
         if self.active is None:
-            return self.anchor.new_zeros(*shape, len(self.sets))
-        dropped = self.anchor.new_full((), torch.inf)
+            return self.bounds.low.new_zeros(*shape, len(self.sets))
+        dropped = self.bounds.low.new_full((), torch.inf)
         return torch.where(self.active, 0.0, dropped).expand(*shape, len(self.sets))
 
     def counts(self, stage: int) -> Tensor | None:

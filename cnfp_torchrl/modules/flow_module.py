@@ -18,7 +18,7 @@ from torchrl.modules import SafeProbabilisticModule
 
 from cnfp_torchrl.bijectors import Bijector, reach
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
-from cnfp_torchrl.geometry import Box, Region
+from cnfp_torchrl.geometry import Box, ConstraintSet, Region
 from cnfp_torchrl.keys import ACTION_KEY, ANCHOR_KEY, LOC_KEY, SCALE_KEY, require
 from cnfp_torchrl.modules.action_bounds import ActionBounds, action_bounds
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_order
@@ -181,25 +181,16 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         Raises:
             MissingGeometryError: when geometry, anchor, active flags or relaxations are missing.
         """
-        bounds = self._bounds_beside(tensordict)
-        if not self.flow.reads_constraints:
-            return self.flow(bounds, [])
-        sets = [bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors]
-        if not self.flow.is_safe:
-            return self.flow(bounds, sets)
-        anchor = self._anchor(tensordict).to(self.action_dtype)
-        relaxation = tuple(amount.to(self.action_dtype) for amount in self._relaxation(tensordict))
-        return self.flow(bounds, sets, anchor, self._active(tensordict), relaxation)
+        if self.flow.is_safe:
+            return self.flow(self._region(tensordict).to(self.action_dtype))
+        sets: list[ConstraintSet] = [self._bounds_beside(tensordict)]
+        if self.flow.reads_constraints:
+            sets += (each.get_set(tensordict).to(self.action_dtype) for each in self.bijectors)
+        return self.flow(Region(sets, validate_args=False))
 
     def get_region(self, tensordict: TensorDictBase) -> Region:
         """Return the region of allowed actions, for any flow; needs anchor, flags, relaxations."""
-        sets = [bijector.get_set(tensordict) for bijector in self.bijectors]
-        return Region(
-            (self._bounds_beside(tensordict), *sets),
-            self._anchor(tensordict),
-            self._active(tensordict),
-            self._relaxation(tensordict),
-        )
+        return self._region(tensordict, validate_args=True)
 
     def get_dist(self, tensordict: TensorDictBase) -> ConstrainedFlow:
         """Return the distribution over actions in the states of a tensordict."""
@@ -207,6 +198,12 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bijector = self.get_bijector(tensordict)
         if self.flow.reads_constraints:
             refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
+        if loc.shape[-1] != self.action_dim or scale.shape[-1] not in (1, self.action_dim):
+            raise ValueError(
+                f"keys {self.parameter_keys}: expected a Gaussian of {self.action_dim} components, "
+                f"as the action has, given shapes {tuple(loc.shape)} and {tuple(scale.shape)}; "
+                "build the network for this action spec"
+            )
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
         distribution = self.distribution_type(base, bijector)
         if not self._has_warned:
@@ -252,6 +249,15 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             found = (tensordict.get(key, None) for key in self.in_keys)
             device = next((value.device for value in found if value is not None), None)
         return self._bounds.on(device)
+
+    def _region(self, tensordict: TensorDictBase, *, validate_args: bool = False) -> Region:
+        return Region(
+            [self._bounds_beside(tensordict), *(b.get_set(tensordict) for b in self.bijectors)],
+            self._anchor(tensordict),
+            self._active(tensordict),
+            self._relaxation(tensordict),
+            validate_args=validate_args,
+        )
 
     def _anchor(self, tensordict: TensorDictBase) -> Tensor:
         return require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)

@@ -6,10 +6,8 @@ A flow is a small callable, named by `_target_` in ``conf/flow/`` or by its name
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import ClassVar
-
-from torch import Tensor
 
 from cnfp_torchrl.bijectors import (
     Bijector,
@@ -21,7 +19,7 @@ from cnfp_torchrl.bijectors import (
     SquashChain,
     paper_squash,
 )
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
+from cnfp_torchrl.geometry import Ball, ConstraintSet, Region
 
 
 class Flow(ABC):
@@ -37,25 +35,12 @@ class Flow(ABC):
     """Whether actions have a log-density; without one, only the reference entropy exists."""
 
     @abstractmethod
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        anchor: Tensor | None = None,
-        active: Tensor | None = None,
-        relaxation: tuple[Tensor, ...] | None = None,
-    ) -> Bijector:
-        """Return the bijector.
+    def __call__(self, region: Region) -> Bijector:
+        """Return the bijector of a region, whose values were checked where they entered.
 
         Args:
-            bounds: The action bounds.
-            sets: The constraints' sets in order of application.
-            anchor: A point strictly inside all sets but dropped ones, ``(*batch, d)``; for exact
-                flows.
-            active: Flags that say which of bounds and sets hold, ``(*batch, K + 1)``; for exact
-                flows.
-            relaxation: The amounts by which the rows of bounds and sets are widened, each
-                ``(*batch, m)``; for exact flows. None drops the sets which do not hold.
+            region: The action bounds and the constraints' sets in order of application. A safe flow
+                takes them as relaxed, and its anchor; other flows read the sets alone.
         """
 
 
@@ -67,21 +52,8 @@ class RegionFlow(Flow):
     squash: ClassVar[Callable[..., Bijector]]
     """The class of the bijector, made of a region."""
 
-    def onto(self, region: Region) -> Bijector:
-        """Return the bijector onto a region, which comes checked."""
+    def __call__(self, region: Region) -> Bijector:
         return self.squash(region, validate_args=False)
-
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        anchor: Tensor | None = None,
-        active: Tensor | None = None,
-        relaxation: tuple[Tensor, ...] | None = None,
-    ) -> Bijector:
-        assert anchor is not None
-        region = Region((bounds, *sets), anchor, active, relaxation, validate_args=False)
-        return self.onto(region)
 
 
 class ExactFlow(RegionFlow):
@@ -131,16 +103,8 @@ class SquashFlow(Flow):
             raise ValueError(f"max_radius: expected a number > 0, given {max_radius}")
         self.max_radius = max_radius
 
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        anchor: Tensor | None = None,
-        active: Tensor | None = None,
-        relaxation: tuple[Tensor, ...] | None = None,
-    ) -> Bijector:
-        if not sets:
-            return paper_squash(bounds)
+    def __call__(self, region: Region) -> Bijector:
+        sets = region.sets[1:] or (region.bounds,)
         return SquashChain([paper_squash(self._limited(allowed)) for allowed in sets])
 
     def _limited(self, allowed: ConstraintSet) -> ConstraintSet:
@@ -167,7 +131,7 @@ class ProjectionFlow(RegionFlow):
             raise ValueError(f"rounds: expected a number >= 1, given {rounds}")
         self.rounds = rounds
 
-    def onto(self, region: Region) -> Projection:
+    def __call__(self, region: Region) -> Projection:
         return Projection(region, rounds=self.rounds, validate_args=False)
 
 
@@ -177,15 +141,8 @@ class UnconstrainedFlow(Flow):
     is_safe = False
     reads_constraints = False
 
-    def __call__(
-        self,
-        bounds: Box,
-        sets: Sequence[ConstraintSet],
-        anchor: Tensor | None = None,
-        active: Tensor | None = None,
-        relaxation: tuple[Tensor, ...] | None = None,
-    ) -> BoxSquash:
-        return BoxSquash(bounds.low, bounds.high, validate_args=False)
+    def __call__(self, region: Region) -> BoxSquash:
+        return BoxSquash(region.bounds.low, region.bounds.high, validate_args=False)
 
 
 FLOWS: Mapping[str, type[Flow]] = {
@@ -196,6 +153,22 @@ FLOWS: Mapping[str, type[Flow]] = {
     "projection": ProjectionFlow,
     "unconstrained": UnconstrainedFlow,
 }
+
+
+def resolve_safe_flow(flow: Flow | str) -> Flow:
+    """Return the flow of a name, or the flow itself, if it guarantees the constraints.
+
+    Raises:
+        ValueError: when the name is unknown, or the flow guarantees nothing.
+    """
+    resolved = resolve_flow(flow)
+    if not resolved.is_safe:
+        safe = [name for name, each in FLOWS.items() if each.is_safe]
+        raise ValueError(
+            f"flow: expected one that guarantees the constraints, such as {safe}, given "
+            f"{type(resolved).__name__}"
+        )
+    return resolved
 
 
 def resolve_flow(flow: Flow | str) -> Flow:

@@ -8,15 +8,16 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.geometry import Region
+from cnfp_torchrl.geometry import Box, Region
 from cnfp_torchrl.modules.action_bounds import action_bounds, refuse_other_bounds
 from cnfp_torchrl.modules.actors import flow_head
 from cnfp_torchrl.modules.exploration import refuse_exploration
-from cnfp_torchrl.modules.flow_module import refuse_other_batch
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, refuse_other_batch
 
 
 class ConstraintViolationError(RuntimeError):
@@ -138,6 +139,24 @@ class ExecutedActionGuard(TensorDictModuleBase):
         return tensordict
 
 
+def refuse_misfit(policy: nn.Module, bounds: Box, action_key: NestedKey) -> None:
+    """Refuse a policy that cannot act in an environment within its constraints.
+
+    Args:
+        policy: A policy, such as a constrained actor alone or in a sequence; others are not judged.
+        bounds: The environment's action bounds, ``(d,)``.
+        action_key: The environment's key of the action.
+
+    Raises:
+        TypeError: when it explores behind its flow.
+        ValueError: when the action bounds of its flow are not the environment's.
+    """
+    refuse_exploration(policy)
+    for module in policy.modules():
+        if isinstance(module, ConstrainedFlowModule) and module.action_key == action_key:
+            refuse_other_bounds("actor", module.bounds, bounds)
+
+
 def guarded(
     actor: SafeProbabilisticTensorDictSequential,
     env: EnvBase | None = None,
@@ -158,10 +177,9 @@ def guarded(
             with a flow that guarantees nothing.
     """
     refuse_exploration(actor)
-    if env is not None:
-        bounds = action_bounds(env.full_action_spec, env.action_key)
-        refuse_other_bounds("actor", flow_head(actor).bounds, bounds)
     flow = flow_head(actor).flow
+    if env is not None:
+        refuse_misfit(actor, action_bounds(env.full_action_spec, env.action_key), env.action_key)
     if not flow.is_safe:
         if refuse_relaxation:
             raise ValueError(

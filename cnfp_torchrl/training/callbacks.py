@@ -42,6 +42,10 @@ class TrainingCallback(EpisodeCallback, Protocol):
         """TorchRL loggers that get the scalars of training, too."""
         ...
 
+    def continue_at(self, frames: int) -> None:
+        """Go on after as many environment steps, of a run that goes on; called before the first."""
+        ...
+
     def on_batch(self, batch: TensorDictBase) -> None:
         """Take a batch of transitions ``(*environments, time)``, without changing it."""
         ...
@@ -75,6 +79,9 @@ class NoCallback:
     """Does nothing."""
 
     loggers: Sequence[Logger] = ()
+
+    def continue_at(self, frames: int) -> None:
+        """Do nothing."""
 
     def on_batch(self, batch: TensorDictBase) -> None:
         """Do nothing."""

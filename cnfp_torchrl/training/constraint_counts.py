@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
+from cnfp_torchrl.envs import counted_constraints
 from cnfp_torchrl.keys import (
     CONSTRAINT_STATES,
     CONSTRAINTS_KEY,
@@ -21,7 +22,6 @@ from cnfp_torchrl.keys import (
     active_key,
     relaxation_key,
 )
-from cnfp_torchrl.training.environment import counted_constraints
 
 NOT_COUNTED = "not counted"
 """The text in place of a count where nothing judges a constraint, which is not a count of 0."""
@@ -164,6 +164,14 @@ class ConstraintTally:
             columns = violated[:, [self.judged.index(name) for name in self._judged_published]]
             rows = [self.published.index(name) for name in self._judged_published]
             yield "while", (states[:, rows] * columns.unsqueeze(-1)).sum(0)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the sums."""
+        return dict(self._sums)
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on counting from sums that `state_dict` has returned."""
+        self._sums = dict(state)
 
     def counts(self) -> dict[str, ConstraintCounts]:
         """Return the counts by constraint: those that are judged first, then the others."""

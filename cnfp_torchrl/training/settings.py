@@ -34,6 +34,27 @@ class TrainingSettings:
 
 
 @dataclass(frozen=True)
+class CheckpointSettings:
+    """How often the state of a run is saved, so that it can go on after it was stopped.
+
+    Args:
+        interval: environment steps between two states; None saves none, not even when stopped.
+        keep: number of newest states that are kept.
+        keep_last: whether a finished run keeps its last state, so that it can be extended.
+
+    Raises:
+        ValueError: naming the setting, what was expected and what was given.
+    """
+
+    interval: int | None = 10_000
+    keep: int = 2
+    keep_last: bool = True
+
+    def __post_init__(self) -> None:
+        require_fields("checkpoint", self)
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """Number and seed of the episodes that policies are judged by.
 

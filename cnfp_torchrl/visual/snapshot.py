@@ -275,8 +275,7 @@ class StagedFlow:
                 device=region.anchor.device,
             )
             active = holds if region.active is None else holds & region.active
-            stages = flow(region.bounds, region.sets[1:], region.anchor, active.unsqueeze(1))
-            self._bijectors = [stages]
+            self._bijectors = [flow(Region(region.sets, region.anchor, active.unsqueeze(1)))]
         else:
             self._bijectors = [stage_bijector(flow, region, each) for each in applied]
 
@@ -316,7 +315,6 @@ def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Biject
         region: of one state.
         applied: indices into the region's sets of those applied so far.
     """
-    constraints = [k for k in applied if k > 0]
-    sets = [region.sets[k] for k in constraints]
-    active = None if region.active is None else region.active[..., [0, *constraints]]
-    return flow(region.bounds, sets, region.anchor, active)
+    chosen = [0, *(k for k in applied if k > 0)]
+    active = None if region.active is None else region.active[..., chosen]
+    return flow(Region([region.sets[k] for k in chosen], region.anchor, active))

@@ -158,6 +158,17 @@ def test_a_region_needs_action_bounds_first() -> None:
         Region((Box(t(-1.0), t(1.0)), ball), t(0.0, 0.0))
 
 
+def test_a_region_without_an_anchor_has_sets_but_no_gauges() -> None:
+    bounds, ball = Box(t(-1.0, -1.0), t(1.0, 1.0)), Ball(t(0.0, 0.0), t(2.0, 0.5))
+    region = Region((bounds, ball)).to(torch.float64)
+    assert region.shape == (2, 2)
+    assert region.contains(t(0.6, 0.6)).tolist() == [True, False]
+    assert region.is_active.shape == region.amounts().shape == (2, 2)
+    for needs_one in (region.eroded, lambda: region.gauges(t(1.0, 0.0)), lambda: region.anchor):
+        with pytest.raises(GeometryError, match=r"anchor: expected a point .*Region\.build"):
+            needs_one()
+
+
 def test_sets_without_interior_are_sets() -> None:
     zero = t(0.0)[0]
     for each in (

@@ -1,5 +1,6 @@
 """Constrained actors in TorchRL's collectors, whose weights are updated on the way."""
 
+import pickle
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -7,12 +8,17 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
+from torchrl.modules import AdditiveGaussianModule
 
-from cnfp_torchrl.modules import make_constrained_actor
+from cnfp_torchrl import constrain_env
+from cnfp_torchrl.envs import constraint_bijectors
+from cnfp_torchrl.modules import WarmUpPolicy, guarded, make_constrained_actor, split_at_latent
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import gaussian_network
 
 MakeActor = Callable[..., Any]
@@ -56,11 +62,7 @@ def test_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
 
 
 def _make_env(seed: int) -> TransformedEnv:
-    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
-    order = ["battery", "obstacle"]
-    return make_environment(
-        PointNavEnv((AGENTS,), seed=seed), geometries, order=order, with_anchor=True
-    )
+    return constrain_env(PointNavEnv((AGENTS,), seed=seed), BatteryGeometry(), ObstacleGeometry())
 
 
 @pytest.mark.slow
@@ -88,3 +90,55 @@ def test_multi_sync_collector(workers: int) -> None:
         assert batches == 3
     finally:
         collector.shutdown()
+
+
+def _collect(env: TransformedEnv, policy: Any, cls: type = Collector) -> Any:
+    return cls(
+        env,
+        policy,
+        frames_per_batch=AGENTS,
+        total_frames=2 * AGENTS,
+        auto_register_policy_transforms=False,
+    )
+
+
+OTHER_BOUNDS = Bounded(-1.0, 1.5, (2,))
+WRAPPED = {
+    "actor": lambda actor: actor,
+    "warm-up": lambda actor: WarmUpPolicy(actor, 10),
+    "guarded": guarded,
+    "latent": lambda actor: split_at_latent(actor).policy,
+    "compiled": lambda actor: torch.compile(actor, backend="eager"),
+}
+
+
+@pytest.mark.parametrize("wrapped", WRAPPED.values(), ids=WRAPPED)
+def test_actor_of_other_bounds_is_refused(
+    env: TransformedEnv, network: nn.Module, wrapped: MakeActor
+) -> None:
+    actor = make_constrained_actor(
+        network, bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS, flow="gauge"
+    )
+    with pytest.raises(ValueError, match=r"actor: expected the environment's action bounds"):
+        _collect(env, wrapped(actor))
+
+
+def test_actor_of_other_bounds_follows_one_that_fits(
+    env: TransformedEnv, make_actor: MakeActor, network: nn.Module
+) -> None:
+    next(iter(_collect(env, make_actor())))
+    pickle.loads(pickle.dumps(env.transform[-1].clone()))
+    actor = make_constrained_actor(network, bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS)
+    with pytest.raises(ValueError, match=r"actor: expected the environment's action bounds"):
+        _collect(env, actor)
+
+
+def test_exploration_behind_the_flow_is_refused(env: TransformedEnv, make_actor: MakeActor) -> None:
+    policy = TensorDictSequential(make_actor(), AdditiveGaussianModule(Bounded(-1.0, 1.0, (2,))))
+    with pytest.raises(TypeError, match="no AdditiveGaussianModule on constrained actions"):
+        _collect(env, policy)
+
+
+def test_policies_of_others_are_not_judged(env: TransformedEnv) -> None:
+    for policy in (None, TensorDictModule(lambda o: o[..., :2], ["observation"], ["action"])):
+        next(iter(_collect(env, policy)))
