@@ -7,7 +7,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
 from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
@@ -37,8 +37,13 @@ def build_environment(
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
+    base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
+    bare = base.base_env if isinstance(base, TransformedEnv) else base
+    if replaced and isinstance(bare, ParallelEnv):
+        base.close()  # each of its environments is a process: no more of them than in training
+        base = instantiate(config.env.base, _convert_="all")
     return make_environment(
-        instantiate(config.env.base, **replaced, _convert_="all"),
+        base,
         {
             name: instantiate(section, _convert_="all")
             for name, section in config.env.geometry.items()
