@@ -12,11 +12,10 @@ with needs_extra("train"):
     import torch
     from tensordict import TensorDictBase
 
-    from cnfp_torchrl.envs import find_task_view
+    from cnfp_torchrl.envs import counted_constraints, find_task_view
     from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
     from cnfp_torchrl.modules import flow_head
     from cnfp_torchrl.training.agent import build_environment, load_actor
-    from cnfp_torchrl.training.environment import counted_constraints
     from cnfp_torchrl.training.episodes import record_episode
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.settings import EvaluationSettings

@@ -34,11 +34,13 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
     changed_actions,
     constraint_bijectors,
+    publishes_constraints,
 )
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
 
@@ -75,11 +77,13 @@ __all__ = [
     "has_density",
     "in_order",
     "make_constrained_actor",
+    "publishes_constraints",
     "refuse_exploration",
     "refuse_misfit",
     "refuse_other_bounds",
     "refuse_relaxed",
     "refuse_violations",
+    "require_fit",
     "resolve_safe_flow",
     "split_at_latent",
     "with_reference_entropy",

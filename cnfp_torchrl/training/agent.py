@@ -7,13 +7,23 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
-from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
-from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
-from cnfp_torchrl.modules import Flow, make_constrained_actor
+from cnfp_torchrl.envs import (
+    GeometryTransform,
+    RewardPenalty,
+    constrain_env,
+    counted_constraints,
+)
+from cnfp_torchrl.keys import OBSERVATION_KEY
+from cnfp_torchrl.modules import (
+    Flow,
+    make_constrained_actor,
+    publishes_constraints,
+    require_fit,
+)
 from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
-from cnfp_torchrl.training.environment import counted_constraints, make_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 
 
@@ -33,7 +43,6 @@ def build_environment(
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
     """
-    flow: Flow = instantiate(config.flow)
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
@@ -42,16 +51,34 @@ def build_environment(
     if replaced and isinstance(bare, ParallelEnv):
         base.close()  # each of its environments is a process: no more of them than in training
         base = instantiate(config.env.base, _convert_="all")
-    return make_environment(
-        base,
-        {
-            name: instantiate(section, _convert_="all")
-            for name, section in config.env.geometry.items()
-        },
-        order=application_order(config),
+    env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
+    penalty = _penalty(config) if with_penalty else None
+    if penalty is not None:  # behind the sum, which is of the reward without it
+        env.append_transform(penalty)
+    geometries = _geometries(config)
+    if not geometries:
+        return env
+    flow: Flow = instantiate(config.flow)
+    order = config.env.get("order")
+    return constrain_env(
+        env,
+        *geometries,
+        order=None if order is None else list(order),
         with_anchor=with_anchor or flow.is_safe,
-        penalty=_penalty(config) if with_penalty else None,
     )
+
+
+def _geometries(config: DictConfig) -> list[GeometryTransform]:
+    """Return the transforms that publish the constraints, in the order of the configuration."""
+    geometries = []
+    for name, section in config.env.get("geometry", {}).items():
+        geometry = instantiate(section, _convert_="all")
+        if geometry.name != name:
+            raise ValueError(
+                f"env.geometry.{name}.name: expected '{name}', given '{geometry.name}'"
+            )
+        geometries.append(geometry)
+    return geometries
 
 
 def _penalty(config: DictConfig) -> RewardPenalty | None:
@@ -62,37 +89,49 @@ def _penalty(config: DictConfig) -> RewardPenalty | None:
     return instantiate(penalty)
 
 
-def application_order(config: DictConfig) -> list[str]:
-    """Return the constraints in order of application: ``env.order``, else that of the geometry."""
-    return list(config.env.get("order", config.env.geometry))
-
-
 def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
-    """Return the actor of a configuration for an environment."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
-    return make_constrained_actor(
-        instantiate(config.network.actor, observation_size, action_size),
-        bijectors=constraint_bijectors(env) if config.env.geometry else [],
-        spec=env.action_spec_unbatched,
-        order=application_order(config),
-        flow=instantiate(config.flow),
-    )
+    """Return the actor of a configuration for an environment.
+
+    Raises:
+        ValueError: when its network does not fit the environment.
+    """
+    flow: Flow = instantiate(config.flow)
+    network = instantiate(config.network.actor, *_sizes(env))
+    if flow.reads_constraints or publishes_constraints(env):
+        return make_constrained_actor(network, env, flow=flow)
+    return make_constrained_actor(network, bijectors=[], spec=env.action_spec_unbatched, flow=flow)
+
+
+def _sizes(env: TransformedEnv) -> tuple[int, int]:
+    """Return the numbers of observed numbers and of action components.
+
+    Raises:
+        ValueError: when the environment observes no vector.
+    """
+    spec = env.observation_spec.get(OBSERVATION_KEY, None)
+    if spec is None or spec.ndim != len(env.batch_size) + 1 or not spec.dtype.is_floating_point:
+        kinds = {str(key): tuple(each.shape) for key, each in env.observation_spec.items()}
+        raise ValueError(
+            f"env.base: expected an environment that publishes a vector of floating numbers at "
+            f"{OBSERVATION_KEY!r}, given one that publishes {kinds}; concatenate what the networks "
+            "are to read with torchrl.envs.CatTensors(in_keys=[...], out_key='observation')"
+        )
+    return spec.shape[-1], env.action_spec_unbatched.shape[-1]
 
 
 def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     """Return the critic of a configuration for an environment."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
-    return instantiate(config.network.critic, observation_size, action_size)
+    critic = instantiate(config.network.critic, *_sizes(env))
+    require_fit("network.critic", critic, env, critic.out_keys[-1:], 1)
+    return critic
 
 
 def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
     """Return the critic of the costs that an environment counts."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
     constraints = len(counted_constraints(env))
-    return instantiate(config.network.cost_critic, observation_size, action_size, constraints)
+    critic = instantiate(config.network.cost_critic, *_sizes(env), constraints)
+    require_fit("network.cost_critic", critic, env, critic.out_keys[-1:], constraints)
+    return critic
 
 
 def build_loss(

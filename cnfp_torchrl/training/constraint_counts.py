@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
+from cnfp_torchrl.envs import counted_constraints
 from cnfp_torchrl.keys import (
     CONSTRAINT_STATES,
     CONSTRAINTS_KEY,
@@ -22,7 +23,6 @@ from cnfp_torchrl.keys import (
     active_key,
     relaxation_key,
 )
-from cnfp_torchrl.training.environment import counted_constraints
 
 NOT_COUNTED = "not counted"
 """The text in place of a count where nothing judges a constraint, which is not a count of 0."""

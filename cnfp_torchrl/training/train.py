@@ -19,7 +19,6 @@ from cnfp_torchrl.configuration import require_settings
 from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import (
-    application_order,
     build_actor,
     build_environment,
     build_loss,
@@ -204,7 +203,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             "steps": metrics.frames,
             "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
-            "order": application_order(config),
+            "order": flow_head(actor).order,
             "seed": config.seed,
         }
         folder.save_summary(summary)

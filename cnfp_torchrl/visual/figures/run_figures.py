@@ -12,10 +12,9 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import find_task_view
+from cnfp_torchrl.envs import counted_constraints, find_task_view
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.colors import constraint_colors
 from cnfp_torchrl.visual.explanation import explain
