@@ -7,7 +7,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
 from cnfp_torchrl.envs import (
@@ -46,7 +46,11 @@ def build_environment(
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
-    base = instantiate(config.env.base, **replaced, _convert_="all")
+    base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
+    bare = base.base_env if isinstance(base, TransformedEnv) else base
+    if replaced and isinstance(bare, ParallelEnv):
+        base.close()  # each of its environments is a process: no more of them than in training
+        base = instantiate(config.env.base, _convert_="all")
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
     penalty = _penalty(config) if with_penalty else None
     if penalty is not None:  # behind the sum, which is of the reward without it

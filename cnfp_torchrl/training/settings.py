@@ -61,6 +61,7 @@ class EvaluationSettings:
     Args:
         episodes: number of whole episodes for each policy.
         seed: seed of the environment and of what policies draw, the same for all of them.
+        max_steps: length at which an episode is cut off, for environments that never end one.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -68,6 +69,7 @@ class EvaluationSettings:
 
     episodes: int = 400
     seed: int = 1000
+    max_steps: int = 1000
 
     def __post_init__(self) -> None:
         require_fields("evaluation", self)

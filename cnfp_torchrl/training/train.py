@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from collections.abc import Mapping
@@ -25,10 +26,9 @@ from cnfp_torchrl.training.agent import (
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
     CallbackFactory,
-    EpisodeRecorder,
     NoCallback,
     TrainingCallback,
-    first_episodes,
+    give_episodes,
 )
 from cnfp_torchrl.training.checkpoints import Attributes
 from cnfp_torchrl.training.constraint_counts import (
@@ -51,6 +51,8 @@ from cnfp_torchrl.training.settings import (
 from cnfp_torchrl.training.storage import prepare_buffer
 from cnfp_torchrl.training.stored_transitions import StoredTransitions
 from cnfp_torchrl.training.update import Update, UpdateBudget
+
+_log = logging.getLogger(__name__)
 
 
 def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dict[str, Any]:
@@ -88,6 +90,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     # Environment, actor and loss
     env = build_environment(config, with_penalty=True)
     env.set_seed(config.seed)
+    tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
@@ -118,6 +121,12 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         _require_steps_to_go(config, folder, done)
         state.drop_what_came_after()
         folder.replace_config(config)
+    _log.info(
+        "training for %s steps, then twice %s episodes of at most %s steps each",
+        config.collector.total_frames,
+        evaluation.episodes,
+        evaluation.max_steps,
+    )
     callback: TrainingCallback = NoCallback()
     if visual is not None:
         recording = folder.new_file(RECORDING) if resume else folder.path / RECORDING
@@ -129,7 +138,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     ]
     metrics = Metrics(
         [*loggers, *callback.loggers],
-        ConstraintTally.of(env),
+        tally,
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
@@ -189,11 +198,8 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
 
         # Evaluation
-        recorders: dict[bool, EpisodeRecorder] = {}
-        if visual is not None:
-            recorders[visual.deterministic] = EpisodeRecorder(first_episodes(visual, evaluation))
         summary = {
-            **_results(metrics, _evaluations(config, actor, evaluation, recorders), score),
+            **_results(metrics, _evaluations(config, actor, evaluation), score),
             "steps": metrics.frames,
             "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
@@ -203,9 +209,9 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         folder.save_summary(summary)
         state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
-        for recorder in recorders.values():
-            for episode in recorder.episodes.values():
-                callback.on_episode(episode)
+        if visual is not None:
+            with closing(build_environment(config, batch_size=[1], with_anchor=True)) as one:
+                give_episodes(callback, visual, evaluation, one, actor)
     return summary
 
 
@@ -236,7 +242,6 @@ def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
     settings: EvaluationSettings,
-    recorders: Mapping[bool, EpisodeRecorder],
 ) -> dict[str, Evaluation]:
     """Evaluate the stochastic policy and the deterministic one.
 
@@ -244,18 +249,12 @@ def _evaluations(
         config: that of the run.
         actor: the trained actor.
         settings: number of episodes and the seed.
-        recorders: what keeps episodes, by whether the policy is deterministic.
     """
-    return {
-        name: evaluate_seeded(
-            build_environment(config, batch_size=[settings.episodes]),
-            guarded(actor),
-            settings,
-            deterministic=deterministic,
-            on_step=recorders.get(deterministic),
-        )
-        for name, deterministic in {"stochastic": False, "deterministic": True}.items()
-    }
+    with closing(build_environment(config, batch_size=[settings.episodes])) as env:
+        return {
+            name: evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic)
+            for name, deterministic in {"stochastic": False, "deterministic": True}.items()
+        }
 
 
 def _results(
