@@ -6,12 +6,14 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.checkpoint import GlobalRNGState
+from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
@@ -39,6 +41,7 @@ from cnfp_torchrl.training.constraint_counts import (
 from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBeginAnewWarning
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
@@ -86,7 +89,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     torch.set_num_threads(config.threads)
 
     # Environment, actor and loss
-    env = build_environment(config, with_penalty=True)
+    env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
     actor = build_actor(config, env)
     loss = build_loss(config, env, actor)
@@ -140,6 +143,12 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     budget = UpdateBudget(settings.update_ratio)
     best = BestPolicy(folder, actor=actor, loss=loss, optimizer=optimizer)
     episodes = CollectorState(collector, env)
+    evaluations = IntervalEvaluation(
+        partial(_evaluation_environment, config, evaluation.interval_episodes),
+        actor,
+        evaluation,
+        score,
+    )
     state.restore(
         {
             "actor": actor,
@@ -148,6 +157,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             "warm_up": Attributes(policy, "frames_left"),
             "budget": Attributes(budget, "due"),
             "best": Attributes(best, "score", "violations"),
+            "evaluations": Attributes(evaluations, "history"),
             "metrics": metrics,
             "collector": episodes,
             "random": GlobalRNGState(),
@@ -177,9 +187,13 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     while budget.spend():
                         metrics.add_losses(update(buffer.sample()))
                 metrics.log_if_due()
+                if (report := evaluations.run_if_due(metrics.frames)) is not None:
+                    metrics.add_evaluation(report)
+                    best.offer_evaluation(report)
                 is_last = metrics.frames >= config.collector.total_frames
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
-                    best.offer(*_training_score(metrics, score))
+                    if evaluation.interval is None:
+                        best.offer(*_training_score(metrics, score))
                     state.save(metrics.frames)
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
@@ -194,6 +208,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             recorders[visual.deterministic] = EpisodeRecorder(first_episodes(visual, evaluation))
         summary = {
             **_results(metrics, _evaluations(config, actor, evaluation, recorders), score),
+            "evaluations_in_training": evaluations.history,
             "steps": metrics.frames,
             "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
@@ -232,6 +247,11 @@ def _training_score(metrics: Metrics, score: LinearScore | None) -> tuple[float,
     return last if score is None else score(last), violations
 
 
+def _evaluation_environment(config: DictConfig, episodes: int) -> TransformedEnv:
+    """Return an environment for some episodes, without a penalty, on the device of training."""
+    return build_environment(config, batch_size=[episodes], device=config.device)
+
+
 def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
@@ -248,7 +268,7 @@ def _evaluations(
     """
     return {
         name: evaluate_seeded(
-            build_environment(config, batch_size=[settings.episodes]),
+            _evaluation_environment(config, settings.episodes),
             guarded(actor),
             settings,
             deterministic=deterministic,

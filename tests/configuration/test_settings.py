@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
@@ -108,3 +110,14 @@ def test_settings_of_other_libraries_own_options_are_left_to_them(
         "+env.base.max_steps=4",
     )
     assert train(config, RunFolder.create(tmp_path / "run"))["steps"] == 32
+
+
+def test_a_task_states_discount_and_target_entropy_unless_they_are_given() -> None:
+    def losses(*overrides: str) -> tuple[Any, Any]:
+        with initialize_config_dir(str(config_directory()), version_base="1.3"):
+            loss = compose("train", overrides=list(overrides)).loss
+        return loss.gamma, loss.target_entropy
+
+    assert losses() == (0.95, -4.0)
+    assert losses("loss.gamma=0.9", "loss.target_entropy=-1") == (0.9, -1)
+    assert losses("~env.gamma", "~env.target_entropy") == (0.99, "auto")
