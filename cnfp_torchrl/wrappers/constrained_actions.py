@@ -41,7 +41,7 @@ class ConstrainedActions(gymnasium.Wrapper[Any, Array, Any, Array]):
         env = ConstrainedActions(gymnasium.make("MyRobot-v0"), SpeedLimit(), KeepDistance())
         model = stable_baselines3.SAC("MlpPolicy", env)
 
-    The geometries read the observation by the keys that TorchRL's `GymEnv` uses: ``observation``,
+    The geometries read the observation by the keys that TorchRL's ``GymEnv`` uses: ``observation``,
     or the names of a dictionary. Wrap before wrappers that change observations.
 
     Every info holds ``constraints``, the geometry of the state that is returned with it, in which
