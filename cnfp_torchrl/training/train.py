@@ -7,12 +7,14 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.checkpoint import GlobalRNGState
+from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
@@ -39,6 +41,7 @@ from cnfp_torchrl.training.constraint_counts import (
 from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBeginAnewWarning
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
@@ -88,7 +91,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     torch.set_num_threads(config.threads)
 
     # Environment, actor and loss
-    env = build_environment(config, with_penalty=True)
+    env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
     tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
@@ -149,6 +152,12 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     budget = UpdateBudget(settings.update_ratio)
     best = BestPolicy(folder, actor=actor, loss=loss, optimizer=optimizer)
     episodes = CollectorState(collector, env)
+    evaluations = IntervalEvaluation(
+        partial(_evaluation_environment, config, evaluation.interval_episodes),
+        actor,
+        evaluation,
+        score,
+    )
     state.restore(
         {
             "actor": actor,
@@ -157,6 +166,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             "warm_up": Attributes(policy, "frames_left"),
             "budget": Attributes(budget, "due"),
             "best": Attributes(best, "score", "violations"),
+            "evaluations": Attributes(evaluations, "history"),
             "metrics": metrics,
             "collector": episodes,
             "random": GlobalRNGState(),
@@ -174,7 +184,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 stacklevel=3,
             )
 
-    with closing(callback):
+    with closing(callback), closing(evaluations):
         with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
             for collected in collector:
                 callback.on_batch(collected)
@@ -186,9 +196,13 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     while budget.spend():
                         metrics.add_losses(update(buffer.sample()))
                 metrics.log_if_due()
+                if (report := evaluations.run_if_due(metrics.frames)) is not None:
+                    metrics.add_evaluation(report)
+                    best.offer_evaluation(report)
                 is_last = metrics.frames >= config.collector.total_frames
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
-                    best.offer(*_training_score(metrics, score))
+                    if evaluation.interval is None:
+                        best.offer(*_training_score(metrics, score))
                     state.save(metrics.frames)
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
@@ -200,6 +214,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         # Evaluation
         summary = {
             **_results(metrics, _evaluations(config, actor, evaluation), score),
+            "evaluations_in_training": evaluations.history,
             "steps": metrics.frames,
             "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
@@ -210,7 +225,9 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
         if visual is not None:
-            with closing(build_environment(config, batch_size=[1], with_anchor=True)) as one:
+            with closing(
+                build_environment(config, batch_size=[1], device=config.device, with_anchor=True)
+            ) as one:
                 give_episodes(callback, visual, evaluation, one, actor)
     return summary
 
@@ -238,6 +255,11 @@ def _training_score(metrics: Metrics, score: LinearScore | None) -> tuple[float,
     return last if score is None else score(last), violations
 
 
+def _evaluation_environment(config: DictConfig, episodes: int) -> TransformedEnv:
+    """Return an environment for some episodes, without a penalty, on the device of training."""
+    return build_environment(config, batch_size=[episodes], device=config.device)
+
+
 def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
@@ -250,7 +272,7 @@ def _evaluations(
         actor: the trained actor.
         settings: number of episodes and the seed.
     """
-    with closing(build_environment(config, batch_size=[settings.episodes])) as env:
+    with closing(_evaluation_environment(config, settings.episodes)) as env:
         return {
             name: evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic)
             for name, deterministic in {"stochastic": False, "deterministic": True}.items()
