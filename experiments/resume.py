@@ -12,18 +12,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 import random
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -98,15 +102,14 @@ def killed_runs(root: Path, *, kills: int, steps: int, seed: int) -> Iterator[li
         seed: seed of the moments.
     """
     moments = random.Random(seed)
-    started = time.perf_counter()
-    if _train(root / "whole", steps) != 0:
-        raise RuntimeError(f"the run in {root / 'whole'} failed")
-    duration = time.perf_counter() - started
+    before = _children_seconds()
+    _is_killed(root / "whole", steps)
+    duration = _children_seconds() - before
     number = 0
     while kills > 0:
         number += 1
         path, killed = root / f"killed{number}", []
-        while _train(path, steps, moments.uniform(0, duration) if kills else None) != 0:
+        while _is_killed(path, steps, moments.uniform(0, duration) if kills else math.inf):
             kills -= 1
             states = [file.stem for file in (path / STATES).glob("state-*")]
             last = max((int(name.rpartition("-")[2]) for name in states), default=0)
@@ -119,25 +122,40 @@ def killed_runs(root: Path, *, kills: int, steps: int, seed: int) -> Iterator[li
         yield [str(number), ", ".join(killed) or "-", ", ".join(different) or "nothing"]
 
 
-def _train(path: Path, steps: int, seconds: float | None = None) -> int:
-    """Train or go on in a process of its own; kill it after a time. Return its exit code."""
+def _is_killed(path: Path, steps: int, seconds: float = math.inf) -> bool:
+    """Train or go on in a process of its own; kill it when it has taken a time of the processor.
+
+    Not by the clock: on a busy machine every kill would come early.
+
+    Args:
+        path: folder of the run.
+        steps: length of the run.
+        seconds: time of the processor, if the process has not ended before.
+    """
     settings = [f"hydra.run.dir={path}", f"collector.total_frames={steps}", *SETTINGS]
     arguments = [f"resume={path}"] if RunFolder(path).has_started else settings
     process = subprocess.Popen(
         [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
+        stderr=subprocess.DEVNULL,
     )
-    try:
-        _, told = process.communicate(timeout=seconds)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        return process.returncode
+    while process.poll() is None:
+        with suppress(psutil.Error):
+            times = psutil.Process(process.pid).cpu_times()
+            if times.user + times.system >= seconds:
+                process.kill()
+                process.wait()
+                return True
+        time.sleep(0.02)
     if process.returncode != 0:
-        raise RuntimeError(f"training failed by itself:\n{told}")
-    return 0
+        raise RuntimeError(f"the run in {path} failed by itself: exit code {process.returncode}")
+    return False
+
+
+def _children_seconds() -> float:
+    """Return the time of the processor that ended processes of this one have taken."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def cost(root: Path, steps: int) -> list[list[str]]:
@@ -195,8 +213,8 @@ def main() -> None:
     text = (
         f"# Killed runs that go on\n\n`python experiments/resume.py {given}`\n\n"
         f"python {platform.python_version()}, {packages}\n\n"
-        f"{options.kills} kills by SIGKILL at moments drawn over the duration of a run, start and "
-        f"evaluation included, of runs of {options.steps} steps that save a state every 400. "
+        f"{options.kills} kills by SIGKILL at moments drawn over the processor time of a run, its "
+        f"start and evaluation included. A run takes {options.steps} steps and saves every 400. "
         "Compared are weights, optimizer, summary, CSV and TensorBoard, but for times.\n\n"
         f"{markdown(rows)}\n\n"
         f"## What states cost\n\nThe default configuration for {options.cost_steps} steps, a state "
