@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 
 from cnfp_torchrl.envs import (
@@ -31,6 +32,7 @@ def build_environment(
     config: DictConfig,
     *,
     batch_size: list[int] | None = None,
+    device: torch.device | str | None = None,
     with_anchor: bool = False,
     with_penalty: bool = False,
 ) -> TransformedEnv:
@@ -39,6 +41,8 @@ def build_environment(
     Args:
         config: configuration with the sections ``env`` and ``flow``.
         batch_size: batch size of environments that have one; None takes that of the configuration.
+        device: device of the environment, and of the actor and the critics made for it; None leaves
+            it where it is.
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
@@ -46,7 +50,13 @@ def build_environment(
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
-    base = instantiate(config.env.base, **replaced, _convert_="all")
+    base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
+    bare = base.base_env if isinstance(base, TransformedEnv) else base
+    if replaced and isinstance(bare, ParallelEnv):
+        base.close()  # each of its environments is a process: no more of them than in training
+        base = instantiate(config.env.base, _convert_="all")
+    if device is not None:
+        base = base.to(device)
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
     penalty = _penalty(config) if with_penalty else None
     if penalty is not None:  # behind the sum, which is of the reward without it
@@ -92,10 +102,16 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
         ValueError: when its network does not fit the environment.
     """
     flow: Flow = instantiate(config.flow)
-    network = instantiate(config.network.actor, *_sizes(env))
+    network = _made(config.network.actor, env)
     if flow.reads_constraints or publishes_constraints(env):
         return make_constrained_actor(network, env, flow=flow)
     return make_constrained_actor(network, bijectors=[], spec=env.action_spec_unbatched, flow=flow)
+
+
+def _made(section: DictConfig, env: TransformedEnv, *sizes: int) -> Any:
+    """Return a network of a configuration, on the environment's device."""
+    network = instantiate(section, *_sizes(env), *sizes)
+    return network if env.device is None else network.to(env.device)
 
 
 def _sizes(env: TransformedEnv) -> tuple[int, int]:
@@ -117,7 +133,7 @@ def _sizes(env: TransformedEnv) -> tuple[int, int]:
 
 def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     """Return the critic of a configuration for an environment."""
-    critic = instantiate(config.network.critic, *_sizes(env))
+    critic = _made(config.network.critic, env)
     require_fit("network.critic", critic, env, critic.out_keys[-1:], 1)
     return critic
 
@@ -125,7 +141,7 @@ def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
 def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
     """Return the critic of the costs that an environment counts."""
     constraints = len(counted_constraints(env))
-    critic = instantiate(config.network.cost_critic, *_sizes(env), constraints)
+    critic = _made(config.network.cost_critic, env, constraints)
     require_fit("network.cost_critic", critic, env, critic.out_keys[-1:], constraints)
     return critic
 

@@ -117,6 +117,20 @@ class Metrics:
         for name, value in losses.items():
             self._losses[name].append(value.detach())
 
+    def add_evaluation(self, report: Mapping[str, Any]) -> None:
+        """Write an evaluation into the log, together with an entry of training.
+
+        Args:
+            report: its ``return_mean``, ``score`` and ``violations``.
+        """
+        self.finish()  # so that what is logged up to here is what a resumed run keeps
+        self._log("evaluation/return", report["return_mean"])
+        if report["score"] is not None:
+            self._log("evaluation/score", report["score"])
+        for name, count in report["violations"].items():
+            if count is not None:
+                self._log(f"evaluation/violations_{name}", count)
+
     def log_if_due(self) -> None:
         """Write an entry of the log when the interval has passed.
 
@@ -161,7 +175,9 @@ class Metrics:
         speed = self._bar.format_dict["rate"]
         if speed:
             self._log("train/steps_per_second", speed)
-        self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
+        ended = not math.isnan(self._last_return)
+        episodes = f"return {self._last_return:.1f}" if ended else "no episode has ended yet"
+        self._bar.set_postfix_str(f"{episodes}, violations {total}")
 
     def _log_constraints(self) -> str:
         """Log the constraints' counts, and return all violations so far as text."""
