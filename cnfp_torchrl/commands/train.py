@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from cnfp_torchrl.commands.extras import needs_extra
@@ -20,24 +21,39 @@ with needs_extra("train"):
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
     from cnfp_torchrl.training.resume import resumed_config
-    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
+
+_HYDRA_FILES = ("config", "hydra", "overrides")
 
 
 def _save_hydra_files(folder: RunFolder, config: DictConfig) -> None:
     """Write Hydra's own files, which Hydra would write over those of a run that has the folder."""
     hydra_config = HydraConfig.get()
-    contents = {
-        "config": config,
-        "hydra": {"hydra": hydra_config},
-        "overrides": hydra_config.overrides.task,
-    }
+    contents = [config, {"hydra": hydra_config}, hydra_config.overrides.task]
     directory = folder.path / ".hydra"
     directory.mkdir(exist_ok=True)
-    for name, content in contents.items():
+    for name, content in zip(_HYDRA_FILES, contents, strict=True):
         with whole_file(directory / f"{name}.yaml") as file:
             file.write(OmegaConf.to_yaml(content).encode())
+
+
+def _remove_unless_started(folder: RunFolder) -> None:
+    """Remove what a run leaves that was refused before it started: Hydra's files, and the folder.
+
+    Anything else in the folder stays, and the folder with it.
+    """
+    if (folder.path / CONFIG).exists():
+        return
+    log = folder.path / f"{HydraConfig.get().job.name}.log"
+    if log.exists() and not log.stat().st_size:
+        log.unlink()
+    for file in _HYDRA_FILES:
+        (folder.path / ".hydra" / f"{file}.yaml").unlink(missing_ok=True)
+    with suppress(OSError):
+        (folder.path / ".hydra").rmdir()
+        folder.path.rmdir()
 
 
 def _summary_text(summary: Mapping[str, Any]) -> str:
@@ -71,6 +87,8 @@ def main(config: DictConfig) -> float | None:
         except TrainingInterrupted as stop:
             sys.stderr.write(f"{stop}\n")
             sys.exit(128 + stop.number)
+        finally:
+            _remove_unless_started(folder)
         if config.figures:
             instantiate(config.figures)(folder)
         sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")

@@ -123,6 +123,7 @@ EXPECTED = {
     "checkpoint.keep_last": FLAG,
     "evaluation.episodes": COUNT,
     "evaluation.seed": WHOLE,
+    "evaluation.max_steps": COUNT,
     "evaluation.interval": _or_null(COUNT),
     "evaluation.interval_episodes": COUNT,
     "audit.states": COUNT,
@@ -176,7 +177,7 @@ def require_settings(config: DictConfig) -> None:
     """Refuse a configuration with a setting of the wrong kind, before any work starts.
 
     Settings that it does not have are passed over: other collectors, losses and optimizers have
-    others.
+    others. A whole number may be written with an exponent, as in 1e4, and is one afterwards.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -184,5 +185,7 @@ def require_settings(config: DictConfig) -> None:
     absent = object()
     for name in EXPECTED:
         given = OmegaConf.select(config, name, default=absent)
-        if given is not absent:
+        if isinstance(given, float) and given.is_integer() and EXPECTED[name].accepts(int(given)):
+            OmegaConf.update(config, name, int(given))
+        elif given is not absent:
             require_setting(name, given)

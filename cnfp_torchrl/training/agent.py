@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 from torchrl.objectives import LossModule
 
@@ -52,7 +52,11 @@ def build_environment(
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
-    base = instantiate(config.env.base, **replaced, _convert_="all")
+    base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
+    bare = base.base_env if isinstance(base, TransformedEnv) else base
+    if replaced and isinstance(bare, ParallelEnv):
+        base.close()  # each of its environments is a process: no more of them than in training
+        base = instantiate(config.env.base, _convert_="all")
     if device is not None:
         base = base.to(device)
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)

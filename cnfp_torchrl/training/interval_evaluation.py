@@ -34,7 +34,8 @@ class IntervalEvaluation:
         settings: EvaluationSettings,
         score: LinearScore | None,
     ) -> None:
-        self._make_env, self._env = make_env, None
+        self._make_env = make_env
+        self._env: EnvBase | None = None
         self._policy = guarded(actor)
         self._settings, self._score = settings, score
         self.history: list[dict[str, Any]] = []
@@ -56,6 +57,12 @@ class IntervalEvaluation:
             result = evaluate_seeded(self._env, self._policy, self._settings.at_interval())
         self.history.append({"step": frames, **self._report(result)})
         return self.history[-1]
+
+    def close(self) -> None:
+        """Close the environment, which may have processes of its own."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
 
     def _report(self, result: Evaluation) -> dict[str, Any]:
         """Return the numbers of a report that make a curve."""

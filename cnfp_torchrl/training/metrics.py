@@ -175,7 +175,9 @@ class Metrics:
         speed = self._bar.format_dict["rate"]
         if speed:
             self._log("train/steps_per_second", speed)
-        self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
+        ended = not math.isnan(self._last_return)
+        episodes = f"return {self._last_return:.1f}" if ended else "no episode has ended yet"
+        self._bar.set_postfix_str(f"{episodes}, violations {total}")
 
     def _log_constraints(self) -> str:
         """Log the constraints' counts, and return all violations so far as text."""

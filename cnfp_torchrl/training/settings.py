@@ -61,6 +61,7 @@ class EvaluationSettings:
     Args:
         episodes: number of whole episodes for each policy, after training.
         seed: seed of the environment and of what policies draw, the same for all of them.
+        max_steps: length at which an episode is cut off, for environments that never end one.
         interval: environment steps of training between two evaluations; None evaluates only after.
         interval_episodes: number of whole episodes of each evaluation during training.
 
@@ -70,6 +71,7 @@ class EvaluationSettings:
 
     episodes: int = 400
     seed: int = 1000
+    max_steps: int = 1000
     interval: int | None = None
     interval_episodes: int = 32
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from collections.abc import Mapping
@@ -25,10 +26,9 @@ from cnfp_torchrl.training.agent import (
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
     CallbackFactory,
-    EpisodeRecorder,
     NoCallback,
     TrainingCallback,
-    first_episodes,
+    give_episodes,
 )
 from cnfp_torchrl.training.checkpoints import Attributes
 from cnfp_torchrl.training.constraint_counts import (
@@ -50,6 +50,8 @@ from cnfp_torchrl.training.settings import (
     TrainingSettings,
     require_frames,
 )
+
+_log = logging.getLogger(__name__)
 
 
 def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dict[str, Any]:
@@ -87,6 +89,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     # Environment, actor, algorithm and collector
     env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
+    tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
     is_saved = saving.interval is not None
     learner: Learner = instantiate(config.algorithm, _partial_=True)(
@@ -102,6 +105,12 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         _require_steps_to_go(config, folder, done)
         state.drop_what_came_after()
         folder.replace_config(config)
+    _log.info(
+        "training for %s steps, then twice %s episodes of at most %s steps each",
+        config.collector.total_frames,
+        evaluation.episodes,
+        evaluation.max_steps,
+    )
     callback: TrainingCallback = NoCallback()
     if visual is not None:
         recording = folder.new_file(RECORDING) if resume else folder.path / RECORDING
@@ -113,7 +122,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     ]
     metrics = Metrics(
         [*loggers, *callback.loggers],
-        ConstraintTally.of(env),
+        tally,
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
@@ -151,7 +160,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 stacklevel=3,
             )
 
-    with closing(callback):
+    with closing(callback), closing(evaluations):
         with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
             for collected in collector:
                 callback.on_batch(collected)
@@ -175,11 +184,8 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         folder.save_checkpoint(**trained)
 
         # Evaluation
-        recorders: dict[bool, EpisodeRecorder] = {}
-        if visual is not None:
-            recorders[visual.deterministic] = EpisodeRecorder(first_episodes(visual, evaluation))
         summary = {
-            **_results(metrics, _evaluations(config, actor, evaluation, recorders), score),
+            **_results(metrics, _evaluations(config, actor, evaluation), score),
             "evaluations_in_training": evaluations.history,
             "steps": metrics.frames,
             "seconds": metrics.seconds,
@@ -190,9 +196,11 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         folder.save_summary(summary)
         state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
-        for recorder in recorders.values():
-            for episode in recorder.episodes.values():
-                callback.on_episode(episode)
+        if visual is not None:
+            with closing(
+                build_environment(config, batch_size=[1], device=config.device, with_anchor=True)
+            ) as one:
+                give_episodes(callback, visual, evaluation, one, actor)
     return summary
 
 
@@ -228,7 +236,6 @@ def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
     settings: EvaluationSettings,
-    recorders: Mapping[bool, EpisodeRecorder],
 ) -> dict[str, Evaluation]:
     """Evaluate the stochastic policy and the deterministic one.
 
@@ -236,18 +243,12 @@ def _evaluations(
         config: that of the run.
         actor: the trained actor.
         settings: number of episodes and the seed.
-        recorders: what keeps episodes, by whether the policy is deterministic.
     """
-    return {
-        name: evaluate_seeded(
-            _evaluation_environment(config, settings.episodes),
-            guarded(actor),
-            settings,
-            deterministic=deterministic,
-            on_step=recorders.get(deterministic),
-        )
-        for name, deterministic in {"stochastic": False, "deterministic": True}.items()
-    }
+    with closing(_evaluation_environment(config, settings.episodes)) as env:
+        return {
+            name: evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic)
+            for name, deterministic in {"stochastic": False, "deterministic": True}.items()
+        }
 
 
 def _results(
