@@ -42,7 +42,7 @@ from cnfp_torchrl.modules.publisher import (
     constraint_bijectors,
     publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
     "ActionBounds",
@@ -62,6 +62,7 @@ __all__ = [
     "ProjectionFlow",
     "RadialFlow",
     "RelaxedConstraintError",
+    "SafeRandomLatents",
     "SafeRandomPolicy",
     "SquashFlow",
     "UnconstrainedFlow",
