@@ -11,7 +11,13 @@ from cnfp_torchrl.geometry.anchor import (
     row_depths,
 )
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
-from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
+from cnfp_torchrl.geometry.box import (
+    ACTION_RANGE,
+    Box,
+    gauge_of_sides,
+    require_action_bounds,
+    sides,
+)
 from cnfp_torchrl.geometry.constraint_set import (
     EROSION_IN_EPS,
     Bounds,
@@ -30,6 +36,7 @@ from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
 from cnfp_torchrl.geometry.weighted_sums import PositivePart, WeightedL1Ball
 
 __all__ = [
+    "ACTION_RANGE",
     "DEPTH",
     "EROSION_IN_EPS",
     "LEEWAY",

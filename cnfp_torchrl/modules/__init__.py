@@ -19,6 +19,7 @@ from cnfp_torchrl.modules.flows import (
     GaugeFlow,
     ProjectionFlow,
     RadialFlow,
+    SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "RadialFlow",
     "RelaxedConstraintError",
     "SafeRandomPolicy",
+    "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",

@@ -10,14 +10,17 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from cnfp_torchrl.bijectors import (
+    SHARPNESS,
     Bijector,
     BoxSquash,
     ExactSquash,
     GaugeSquash,
     Projection,
     RadialSquash,
+    SoftSquash,
     SquashChain,
     paper_squash,
+    require_sharpness,
 )
 from cnfp_torchrl.geometry import Ball, ConstraintSet, Region
 
@@ -73,6 +76,31 @@ class GaugeFlow(RegionFlow):
     """
 
     squash = GaugeSquash
+
+
+class SoftFlow(RegionFlow):
+    """The exact flow with retractions that leave actions nearly as they are inside the region.
+
+    The retraction of `ExactFlow` shortens a whole ray, although only its end is forbidden; this one
+    shortens its end (`cnfp_torchrl.bijectors.SoftSquash`).
+
+    Args:
+        sharpness: The sharpness p, from 1 to 100. A larger one moves actions less, and puts more of
+            them on the boundary up to rounding.
+        by_components: Whether boxes retract each component by itself, not along the ray.
+    """
+
+    def __init__(self, sharpness: float = SHARPNESS, by_components: bool = True) -> None:
+        self.sharpness = require_sharpness(sharpness)
+        self.by_components = by_components
+
+    def __call__(self, region: Region) -> SoftSquash:
+        return SoftSquash(
+            region,
+            sharpness=self.sharpness,
+            by_components=self.by_components,
+            validate_args=False,
+        )
 
 
 class RadialFlow(RegionFlow):
@@ -148,6 +176,7 @@ class UnconstrainedFlow(Flow):
 FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "gauge": GaugeFlow,
+    "soft": SoftFlow,
     "radial": RadialFlow,
     "squash": SquashFlow,
     "projection": ProjectionFlow,
