@@ -12,6 +12,7 @@ constraints and actions of d components::
             row_relaxation  (*batch, m)      the same row by row, of sets that have rows
         safe_action  (*batch, d)         a candidate for the anchor, where a geometry knows one
         anchor       (*batch, d)         the point that gauges are taken about, by ConstraintAnchor
+    previous_action  (*batch, d)         the action that led to the state, by PreviousAction
     loc, scale       (*batch, d)         the Gaussian's parameters, by the network
     latent           (*batch, d)         what was drawn from it, where `split_at_latent` keeps it
     latent_log_prob  (*batch,)
@@ -44,15 +45,20 @@ RESERVED_NAMES = (ANCHOR_KEY[-1], SAFE_ACTION_KEY[-1])
 CONSTRAINT_STATES = ("active", "relaxed", "dropped")
 """What a constraint is in a state: it holds as stated, by a wider set, or not at all."""
 
+OBSERVATION_KEY = "observation"
+ACTION_KEY = "action"
 LOC_KEY = "loc"
 SCALE_KEY = "scale"
-ACTION_KEY = "action"
+PREVIOUS_ACTION_KEY = "previous_action"
 LOG_DET_KEY = "log_det"
 LATENT_KEY = "latent"
 LATENT_LOG_PROB_KEY = "latent_log_prob"
 
 COST_KEY = "cost"
 """Violations of one step, float32 ``(*batch, K)``; columns named by ``constraint_names``."""
+
+EXECUTED_ACTION_KEY = "executed_action"
+"""The allowed action that a free one was mapped to, by `cnfp_torchrl.envs.ConstrainedActions`."""
 
 EPISODE_COST_KEY = "episode_cost"
 """The sum of the costs of an episode so far, float32 ``(*batch, K)``."""

@@ -40,3 +40,13 @@ def test_updates_and_training_are_timed_and_tabulated(tmp_path: Path) -> None:
         assert 0 < row["low"] <= row["ratio"] <= row["high"]
         assert f"| {row['ratio']:.2f} |" in text
     assert update["rows"]["Stable-Baselines3"]["ratio"] == 1
+
+
+def test_what_is_measured_on_a_gpu_is_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "gpu.py"
+    arguments = ["--device", "cpu", "--quick", "--out", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    document = json.loads((tmp_path / "gpu.json").read_text())
+    assert not [key for key in document["about"] if key.endswith("failed")]
+    text = (tmp_path / "gpu.md").read_text()
+    assert all(f"## {title}" in text for title in document["results"])

@@ -16,6 +16,7 @@ with needs_extra("train"):
     from hydra.utils import instantiate
     from omegaconf import DictConfig
 
+    from cnfp_torchrl.commands.paths import takes_any_path
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory, require_settings
     from cnfp_torchrl.text_table import text_table
@@ -48,6 +49,7 @@ def _gave_way(reports: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
                 yield f"{policy}: {name} {text}"
 
 
+@takes_any_path
 @hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
 def main(config: DictConfig) -> None:
     """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""

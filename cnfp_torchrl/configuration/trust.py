@@ -87,7 +87,9 @@ def _tags_and_aliases(text: str) -> Iterator[str]:
             yield f"{what} in line {event.start_mark.line + 1}"
 
 
-def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Path) -> None:
+def require_trusted(
+    content: Mapping[Any, Any], trusted: Sequence[str], path: Path, *, trains: bool = False
+) -> None:
     """Refuse a configuration that names another target, or passes another argument, than it may.
 
     Args:
@@ -95,11 +97,14 @@ def require_trusted(content: Mapping[Any, Any], trusted: Sequence[str], path: Pa
         trusted: The dotted names of further packages, modules or objects; what is defined in them
             may be named and gets any argument. The empty name trusts everything.
         path: The file, for the message.
+        trains: Whether the run is to be trained further, which also calls what the shipped
+            configuration names for training alone, such as PyTorch's optimizers.
 
     Raises:
         PermissionError: naming file, position, target or argument, and the remedy.
     """
-    _Check(path, tuple(map(str.strip, trusted))).walk(content, "", "", is_limited=False)
+    check = _Check(path, tuple(map(str.strip, trusted)), *(_shipped() if trains else ()))
+    check.walk(content, "", "", is_limited=False)
 
 
 @cache
@@ -145,6 +150,26 @@ def locate(name: str) -> Any:
     return found
 
 
+@cache
+def _shipped() -> tuple[frozenset[str], frozenset[str]]:
+    """Return every target of the shipped configuration, and every text in it."""
+    contents = [
+        yaml.safe_load(path.read_text(encoding="utf-8"))
+        for path in config_directory().rglob("*.yaml")
+    ]
+    return frozenset(targets(contents)), frozenset(_texts(contents))
+
+
+def _texts(content: Any) -> Iterator[str]:
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, list):
+        for value in content:
+            yield from _texts(value)
+    elif isinstance(content, str):
+        yield content
+
+
 def _shipped_targets() -> Iterator[str]:
     folder = config_directory()
     for path in folder.rglob("*.yaml"):
@@ -181,10 +206,18 @@ class _Check:
     Args:
         path: The file.
         trusted: The trusted names, see `require_trusted`.
+        further: The targets that may be named beside `nameable`, with limited arguments.
+        texts: The strings that may be arguments whatever they are like.
     """
 
-    def __init__(self, path: Path, trusted: tuple[str, ...]) -> None:
-        self.path, self.trusted = path, trusted
+    def __init__(
+        self,
+        path: Path,
+        trusted: tuple[str, ...],
+        further: frozenset[str] = frozenset(),
+        texts: frozenset[str] = frozenset(),
+    ) -> None:
+        self.path, self.trusted, self.further, self.texts = path, trusted, further, texts
 
     def refuse(self, position: str, expected: str, given: Any) -> NoReturn:
         raise PermissionError(
@@ -211,7 +244,7 @@ class _Check:
             if "${" in content:
                 self.refuse(position, "a value without interpolation", content)
             expected, pattern = _TEXTS.get(name, _WORDS)
-            if is_limited and not pattern.fullmatch(content):
+            if is_limited and not pattern.fullmatch(content) and content not in self.texts:
                 self.refuse(position, expected, content)
 
     def walk_mapping(self, content: dict[Any, Any], position: str, *, is_limited: bool) -> None:
@@ -239,7 +272,7 @@ class _Check:
                 return True
             if any(target.startswith(f"{name.rstrip('.')}.") for name in self.trusted):
                 return self.require_defined(target, position)
-            if target in nameable():
+            if target in nameable() or target in self.further:
                 return False
         which = " or ".join([*FOREIGN, *(f"what is defined in {name}" for name in self.trusted)])
         self.refuse(position, f"a target that the shipped configuration names, {which}", target)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import dropwhile
-
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.geometry_inputs import with_geometry
 from cnfp_torchrl.keys import require
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
-    appended_transforms,
+    changed_actions,
     constraint_bijectors,
     refuse_relaxed,
     refuse_violations,
@@ -69,29 +67,7 @@ class ActionGuard(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         # Read at the root: batched environments must pass it to their workers.
-        state_spec = input_spec["full_state_spec"]
-        if state_spec is None:
-            state_spec = Composite(shape=input_spec.shape, device=input_spec.device)
-        published = self.parent.observation_spec
-        for key in self._flow_head().geometry_keys():
-            if key not in published.keys(True, True):
-                raise ValueError(
-                    f"ActionGuard: expected an environment that publishes {key}, given one that "
-                    "does not; make it with constrain_env"
-                )
-            state_spec[key] = published[key].clone()
-        input_spec["full_state_spec"] = state_spec
-        return input_spec
-
-    def _refuse_changed_actions(self) -> None:
-        transforms = appended_transforms(self.parent)
-        for each in dropwhile(lambda each: not isinstance(each, ConstraintAnchor), transforms):
-            if self.parent.action_key in each.in_keys_inv:
-                raise ValueError(
-                    "ActionGuard: expected to be appended before transforms that change actions, "
-                    f"given one behind {type(each).__name__}, which would change them after the "
-                    "check; append it right after constrain_env"
-                )
+        return with_geometry(input_spec, self.parent.observation_spec, self._flow_head())
 
     def _flow_head(self) -> ConstrainedFlowModule:
         if self._head is None:
@@ -100,7 +76,12 @@ class ActionGuard(Transform):
                     "ActionGuard: expected to be part of an environment, which knows the "
                     "constraints, before use; append it with env.append_transform"
                 )
-            self._refuse_changed_actions()
+            if (changing := changed_actions(self.parent)) is not None:
+                raise ValueError(
+                    "ActionGuard: expected to be appended before transforms that change actions, "
+                    f"given one behind {changing}, which would change them after the check; append "
+                    "it right after constrain_env"
+                )
             self._head = ConstrainedFlowModule(
                 self.parent.action_spec_unbatched,
                 constraint_bijectors(self.parent),

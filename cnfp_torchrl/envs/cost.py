@@ -99,11 +99,20 @@ class ConstraintCost(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.indicators is not None:
-            next_tensordict.set(COST_KEY, self._evaluate(tensordict, next_tensordict))
+            next_tensordict.set(COST_KEY, self.evaluate(tensordict, next_tensordict))
         total = tensordict.get(EPISODE_COST_KEY) + next_tensordict.get(COST_KEY)
         return next_tensordict.set(EPISODE_COST_KEY, total)
 
-    def _evaluate(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+    def evaluate(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+        """Return the costs of a step by the indicators, float32 ``(*batch, K)``.
+
+        Args:
+            tensordict: States and the actions that were executed in them.
+            next_tensordict: What the actions led to.
+
+        Raises:
+            ValueError: for an indicator of the wrong shape or dtype.
+        """
         assert self.indicators is not None
         columns = []
         for name, indicator in self.indicators.items():
@@ -164,3 +173,8 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
             f"with indicators), given {type(env).__name__}"
         )
     return tuple(names)
+
+
+def counted_constraints(env: EnvBase) -> tuple[str, ...]:
+    """Return the names of the columns of ``cost``; none if the environment counts nothing."""
+    return constraint_names(env) if COST_KEY in env.observation_spec.keys() else ()  # noqa: SIM118

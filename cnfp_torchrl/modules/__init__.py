@@ -22,7 +22,9 @@ from cnfp_torchrl.modules.flows import (
     SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
+    resolve_safe_flow,
 )
+from cnfp_torchrl.modules.free_actions import FreeActionMap
 from cnfp_torchrl.modules.guard import (
     ConstraintViolationError,
     ExecutedActionGuard,
@@ -33,10 +35,13 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
+    changed_actions,
     constraint_bijectors,
+    publishes_constraints,
 )
 from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
 
@@ -50,6 +55,7 @@ __all__ = [
     "ExecutedActionGuard",
     "Flow",
     "FlowMap",
+    "FreeActionMap",
     "GaugeFlow",
     "LatentActor",
     "LostDensityWarning",
@@ -65,6 +71,7 @@ __all__ = [
     "action_bounds",
     "actor_modules",
     "appended_transforms",
+    "changed_actions",
     "constrain",
     "constraint_bijectors",
     "flow_head",
@@ -72,11 +79,14 @@ __all__ = [
     "has_density",
     "in_order",
     "make_constrained_actor",
+    "publishes_constraints",
     "refuse_exploration",
     "refuse_misfit",
     "refuse_other_bounds",
     "refuse_relaxed",
     "refuse_violations",
+    "require_fit",
+    "resolve_safe_flow",
     "split_at_latent",
     "with_reference_entropy",
 ]

@@ -27,32 +27,41 @@ class ActionBounds(nn.Module):
 
     def __init__(self, box: Box) -> None:
         super().__init__()
-        self._low, self._high = box.low, box.high
+        self._box = Box(box.low, box.high, validate_args=False)
+        self._elsewhere: dict[torch.device, Box] = {}
 
     @property
     def dim(self) -> int:
         """The number of components of an action."""
-        return int(self._low.shape[-1])
+        return self._box.dim
 
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of the action spec."""
-        return self._low.dtype
+        return self._box.dtype
 
     def on(self, device: torch.device | None) -> Box:
         """Return the bounds on a device; None takes the module's."""
-        # At each use: a loss that is moved takes along parameters and buffers, not their modules.
-        low, high = self._low.to(device), self._high.to(device)
-        return Box(low, high, validate_args=False)
+        if device is None or device == self._box.low.device:
+            return self._box
+        # A loss that is moved takes along parameters and buffers, not their modules. Copied once a
+        # device: each copy to a GPU waits for it.
+        if device not in self._elsewhere:
+            self._elsewhere[device] = self._box.to(device=device)
+        return self._elsewhere[device]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        device = fn(self._low.new_empty(0)).device
+        device = fn(self._box.low.new_empty(0)).device
         if device.type != "meta":
-            self._low, self._high = self._low.to(device), self._high.to(device)
+            self._box, self._elsewhere = self._box.to(device=device), {}
         return self
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process need not have the devices.
+        return {**self.__dict__, "_elsewhere": {}}
+
     def extra_repr(self) -> str:
-        return f"low={self._low.tolist()}, high={self._high.tolist()}"
+        return f"low={self._box.low.tolist()}, high={self._box.high.tolist()}"
 
 
 def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
@@ -75,7 +84,8 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
     if bounds is None:
         raise ValueError(
             f"spec of '{action_key}': expected a continuous spec of vectors with bounds on both "
-            f"sides, the first stage of every flow, {given}"
+            f"sides, the first stage of every flow, {given}; give the environment an action spec "
+            "such as torchrl.data.Bounded(low, high, (d,)), and discrete choices another actor"
         )
     if shape[:-1] != batch:
         raise ValueError(

@@ -198,6 +198,12 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bijector = self.get_bijector(tensordict)
         if self.flow.reads_constraints:
             refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
+        if loc.shape[-1] != self.action_dim or scale.shape[-1] not in (1, self.action_dim):
+            raise ValueError(
+                f"keys {self.parameter_keys}: expected a Gaussian of {self.action_dim} components, "
+                f"as the action has, given shapes {tuple(loc.shape)} and {tuple(scale.shape)}; "
+                "build the network for this action spec"
+            )
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
         distribution = self.distribution_type(base, bijector)
         if not self._has_warned:

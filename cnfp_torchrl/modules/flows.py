@@ -184,6 +184,22 @@ FLOWS: Mapping[str, type[Flow]] = {
 }
 
 
+def resolve_safe_flow(flow: Flow | str) -> Flow:
+    """Return the flow of a name, or the flow itself, if it guarantees the constraints.
+
+    Raises:
+        ValueError: when the name is unknown, or the flow guarantees nothing.
+    """
+    resolved = resolve_flow(flow)
+    if not resolved.is_safe:
+        safe = [name for name, each in FLOWS.items() if each.is_safe]
+        raise ValueError(
+            f"flow: expected one that guarantees the constraints, such as {safe}, given "
+            f"{type(resolved).__name__}"
+        )
+    return resolved
+
+
 def resolve_flow(flow: Flow | str) -> Flow:
     """Return the flow of a name, or the flow itself.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, DTypeCastTransform, EnvBase, Transform, TransformedEnv
 
 from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector
 
@@ -35,7 +35,8 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
         env: An environment such as `constrain_env` returns; not a batch of them in workers.
 
     Raises:
-        ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out.
+        ValueError: when it publishes no constraint, or one that its `ConstraintAnchor` leaves out,
+            and when a transform behind that changes actions: the sets are not of those.
     """
     publishers = [t for t in appended_transforms(env) if isinstance(t, ConstraintPublisher)]
     if publishers:
@@ -56,7 +57,29 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
             f"env: expected its ConstraintAnchor to know all constraints, given one with "
             f"{sorted(known)} that leaves out {left_out}; pass all geometries to one constrain_env"
         )
+    if (changing := changed_actions(env)) is not None:
+        raise ValueError(
+            f"env: expected constraints of the actions that it takes, given {changing} behind "
+            "them, which maps these to others; with ConstrainedActions any actor is safe as it "
+            "is, and other transforms of actions belong into the environment that is constrained"
+        )
     return bijectors
+
+
+def publishes_constraints(env: EnvBase) -> bool:
+    """Tell whether an environment's own transforms publish any constraint."""
+    return any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
+
+
+def changed_actions(env: EnvBase) -> str | None:
+    """Return the name of a transform that changes actions behind a `ConstraintAnchor`, or None."""
+    transforms = iter(appended_transforms(env))
+    if not any(isinstance(each, ConstraintPublisher) and each.states_order for each in transforms):
+        return None
+    for each in transforms:
+        if env.action_key in each.in_keys_inv and not isinstance(each, DTypeCastTransform):
+            return type(each).__name__
+    return None
 
 
 def appended_transforms(env: EnvBase) -> list[Transform]:

@@ -6,7 +6,9 @@ import math
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -41,7 +43,8 @@ class Metrics:
         interval: int,
     ) -> None:
         self.frames = 0
-        self._started = time.perf_counter(), time.process_time()
+        # The run's own times, which begin earlier where it goes on from a checkpoint.
+        self._started = [time.perf_counter(), time.process_time()]
         self._logged_at = 0
         self._recent, self._before = tally, tally.counts()
         self._loggers = list(loggers)
@@ -59,6 +62,46 @@ class Metrics:
         recent = self._recent.counts()
         return {name: before + recent[name] for name, before in self._before.items()}
 
+    @property
+    def last_return(self) -> float:
+        """The mean return at the last entry of the log; NaN before the first episode has ended."""
+        return self._last_return
+
+    @property
+    def seconds(self) -> float:
+        """The time of the run so far, without pauses before it was resumed."""
+        return time.perf_counter() - self._started[0]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all counts and what the next entry of the log will tell; flushes the loggers."""
+        for logger in self._loggers:
+            logger.flush()
+        return {
+            "frames": self.frames,
+            "logged_at": self._logged_at,
+            "next_log": self._next_log,
+            "seconds": [self.seconds, time.process_time() - self._started[1]],
+            "before": {name: asdict(counts) for name, counts in self._before.items()},
+            "recent": self._recent.state_dict(),
+            "returns": list(self._returns),
+            "losses": {name: list(values) for name, values in self._losses.items()},
+            "last_return": self._last_return,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that `state_dict` has returned."""
+        self.frames, self._logged_at = state["frames"], state["logged_at"]
+        self._next_log = state["next_log"]
+        clocks = time.perf_counter(), time.process_time()
+        self._started = [now - past for now, past in zip(clocks, state["seconds"], strict=True)]
+        self._before = {name: ConstraintCounts(**each) for name, each in state["before"].items()}
+        self._recent.load_state_dict(state["recent"])
+        self._returns = list(state["returns"])
+        self._losses.update({name: list(values) for name, values in state["losses"].items()})
+        self._last_return = state["last_return"]
+        self._bar.initial = self._bar.n = self.frames
+        self._bar.refresh()
+
     def add_steps(self, batch: TensorDictBase) -> None:
         """Count a batch ``(steps,)`` of transitions."""
         self._recent.add(batch)
@@ -74,6 +117,20 @@ class Metrics:
         for name, value in losses.items():
             self._losses[name].append(value.detach())
 
+    def add_evaluation(self, report: Mapping[str, Any]) -> None:
+        """Write an evaluation into the log, together with an entry of training.
+
+        Args:
+            report: its ``return_mean``, ``score`` and ``violations``.
+        """
+        self.finish()  # so that what is logged up to here is what a resumed run keeps
+        self._log("evaluation/return", report["return_mean"])
+        if report["score"] is not None:
+            self._log("evaluation/score", report["score"])
+        for name, count in report["violations"].items():
+            if count is not None:
+                self._log(f"evaluation/violations_{name}", count)
+
     def log_if_due(self) -> None:
         """Write an entry of the log when the interval has passed.
 
@@ -85,13 +142,16 @@ class Metrics:
             self._log_entry()
 
     def finish(self) -> None:
-        """Write what is left as a last entry, and finish the progress bar.
+        """Write what is left as a last entry.
 
         Raises:
             FloatingPointError: when a loss or a return is not finite.
         """
         if self.frames > self._logged_at:
             self._log_entry()
+
+    def close(self) -> None:
+        """Finish the progress bar and end what the loggers started."""
         self._bar.close()
         for logger in self._loggers:
             if isinstance(logger, TensorboardLogger):
@@ -115,7 +175,9 @@ class Metrics:
         speed = self._bar.format_dict["rate"]
         if speed:
             self._log("train/steps_per_second", speed)
-        self._bar.set_postfix_str(f"return {self._last_return:.1f}, violations {total}")
+        ended = not math.isnan(self._last_return)
+        episodes = f"return {self._last_return:.1f}" if ended else "no episode has ended yet"
+        self._bar.set_postfix_str(f"{episodes}, violations {total}")
 
     def _log_constraints(self) -> str:
         """Log the constraints' counts, and return all violations so far as text."""

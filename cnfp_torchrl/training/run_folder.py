@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
+import shlex
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +19,10 @@ from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted,
 from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
+BEST = "best.pt"
+"""The policy of the best score in training, in the form of the last one's `CHECKPOINT`."""
+STATES = "checkpoints"
+"""The folder of the states that a run goes on from."""
 
 
 class RunFolder:
@@ -71,6 +76,45 @@ class RunFolder:
         return True
 
     @classmethod
+    def resume(cls, path: str | Path) -> RunFolder:
+        """Return the folder of a run that is to go on, held until closed, or gone.
+
+        Raises:
+            FileNotFoundError: when it is not the folder of a run that has started.
+            FileExistsError: when another process works in it.
+        """
+        folder = cls(path)
+        if not (folder.path / CONFIG).is_file():
+            raise FileNotFoundError(
+                f"resume: expected the folder of a run, with {CONFIG}, but {folder.path} has none; "
+                "give the folder that training printed"
+            )
+        if not folder._hold():
+            raise FileExistsError(
+                f"resume: expected a run that was stopped, but one works in {folder.path}; wait "
+                "for it, or stop it"
+            )
+        return folder
+
+    @property
+    def has_started(self) -> bool:
+        """Tell whether a run has written its configuration."""
+        return (self.path / CONFIG).is_file()
+
+    @property
+    def is_held(self) -> bool:
+        """Tell whether a process works in the folder, which can be told on its machine alone."""
+        if not self._hold():
+            return True
+        self.close()
+        return False
+
+    @property
+    def is_finished(self) -> bool:
+        """Tell whether training has ended and written its summary."""
+        return (self.path / SUMMARY).is_file()
+
+    @classmethod
     def open(cls, path: str | Path) -> RunFolder:
         """Return the folder of a finished run.
 
@@ -83,7 +127,7 @@ class RunFolder:
             raise FileNotFoundError(
                 f"run: expected the folder of a finished run with {CONFIG} and {CHECKPOINT}, but "
                 f"{folder.path} lacks {missing}; give the folder that training printed when it "
-                "ended, or train again"
+                f"ended, finish the run with cnfp-train resume={folder.path}, or train again"
             )
         return folder
 
@@ -94,6 +138,11 @@ class RunFolder:
             FileExistsError: when another run has written its own in the meantime.
         """
         with whole_file(self.path / CONFIG, exclusive=True) as file:
+            file.write(OmegaConf.to_yaml(config, resolve=True).encode())
+
+    def replace_config(self, config: DictConfig) -> None:
+        """Write the configuration of a run that goes on with other settings than before."""
+        with whole_file(self.path / CONFIG) as file:
             file.write(OmegaConf.to_yaml(config, resolve=True).encode())
 
     def load_settings(self) -> dict[str, Any]:
@@ -117,6 +166,31 @@ class RunFolder:
             ValueError: when it is not plain YAML, lacks a section, or is of version 0.1.
             PermissionError: when it would do anything else than build what it may name.
         """
+        content = self._known_settings()
+        content = {
+            name: section
+            for name, section in content.items()
+            if name in BUILT or not any(True for _ in targets(section))
+        }
+        require_trusted(content, trusted, self.path / CONFIG)
+        return OmegaConf.create(content)
+
+    def load_training_config(self, trusted: Sequence[str] = ()) -> DictConfig:
+        """Read what the run can be trained further from: all of its configuration.
+
+        Args:
+            trusted: see `load_config`.
+
+        Raises:
+            ValueError: as `load_config`.
+            PermissionError: when it names anything in any section that is not trusted.
+        """
+        content = self._known_settings()
+        require_trusted(content, trusted, self.path / CONFIG, trains=True)
+        return OmegaConf.create(content)
+
+    def _known_settings(self) -> dict[str, Any]:
+        """Read the configuration of a run of this version as plain data."""
         path = self.path / CONFIG
         content = read_plain(path)
         if missing := [name for name in BUILT[:3] if name not in content]:
@@ -129,18 +203,14 @@ class RunFolder:
                 f"{path}: written by version 0.1, whose configurations have other names; evaluate "
                 "the run with that version, or train it again"
             )
-        content = {
-            name: section
-            for name, section in content.items()
-            if name in BUILT or not any(True for _ in targets(section))
-        }
-        require_trusted(content, trusted, path)
-        return OmegaConf.create(content)
+        return content
 
-    def save_checkpoint(self, **modules: nn.Module | torch.optim.Optimizer) -> None:
+    def save_checkpoint(
+        self, file_name: str = CHECKPOINT, /, **modules: nn.Module | torch.optim.Optimizer
+    ) -> None:
         """Write the state dicts of modules and optimizers under their names."""
         state = {name: module.state_dict() for name, module in modules.items()}
-        with whole_file(self.path / CHECKPOINT) as file:
+        with whole_file(self.path / file_name) as file:
             torch.save(state, file)
 
     def load_checkpoint(self) -> dict[str, Any]:
@@ -186,6 +256,21 @@ class RunFolder:
             f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
             f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
+        )
+
+    def new_file(self, name: str) -> Path:
+        """Return a path that is not taken: the name, or with the next number before its suffix."""
+        path, number = self.path / name, 1
+        while path.exists():
+            number += 1
+            path = (self.path / name).with_stem(f"{Path(name).stem}-{number}")
+        return path
+
+    def how_to_resume(self, frames: int) -> str:
+        """Return a sentence for whoever stopped the run."""
+        return (
+            f"stopped and saved at step {frames}; go on with: "
+            f"cnfp-train resume={shlex.quote(str(self.path))}"
         )
 
     def save_summary(self, summary: dict[str, Any]) -> None:

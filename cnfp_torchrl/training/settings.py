@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -34,12 +34,36 @@ class TrainingSettings:
 
 
 @dataclass(frozen=True)
+class CheckpointSettings:
+    """How often the state of a run is saved, so that it can go on after it was stopped.
+
+    Args:
+        interval: environment steps between two states; None saves none, not even when stopped.
+        keep: number of newest states that are kept.
+        keep_last: whether a finished run keeps its last state, so that it can be extended.
+
+    Raises:
+        ValueError: naming the setting, what was expected and what was given.
+    """
+
+    interval: int | None = 10_000
+    keep: int = 2
+    keep_last: bool = True
+
+    def __post_init__(self) -> None:
+        require_fields("checkpoint", self)
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """Number and seed of the episodes that policies are judged by.
 
     Args:
-        episodes: number of whole episodes for each policy.
+        episodes: number of whole episodes for each policy, after training.
         seed: seed of the environment and of what policies draw, the same for all of them.
+        max_steps: length at which an episode is cut off, for environments that never end one.
+        interval: environment steps of training between two evaluations; None evaluates only after.
+        interval_episodes: number of whole episodes of each evaluation during training.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -47,9 +71,16 @@ class EvaluationSettings:
 
     episodes: int = 400
     seed: int = 1000
+    max_steps: int = 1000
+    interval: int | None = None
+    interval_episodes: int = 32
 
     def __post_init__(self) -> None:
         require_fields("evaluation", self)
+
+    def at_interval(self) -> EvaluationSettings:
+        """Return the settings of the evaluations during training."""
+        return replace(self, episodes=self.interval_episodes)
 
 
 def require_frames(config: DictConfig) -> None:

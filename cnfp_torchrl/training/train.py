@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import time
+import logging
+import sys
+import warnings
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
 from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
 from cnfp_torchrl.training.agent import (
-    application_order,
     build_actor,
     build_environment,
     build_loss,
@@ -24,47 +28,62 @@ from cnfp_torchrl.training.agent import (
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
     CallbackFactory,
-    EpisodeRecorder,
     NoCallback,
     TrainingCallback,
-    first_episodes,
+    give_episodes,
 )
+from cnfp_torchrl.training.checkpoints import Attributes
 from cnfp_torchrl.training.constraint_counts import (
     ConstraintTally,
     constraint_reports,
     violations_of,
 )
+from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBeginAnewWarning
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
+from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.metrics import Metrics
-from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.settings import EvaluationSettings, TrainingSettings, require_frames
+from cnfp_torchrl.training.run_folder import STATES, RunFolder
+from cnfp_torchrl.training.run_state import BestPolicy, RunState
+from cnfp_torchrl.training.settings import (
+    CheckpointSettings,
+    EvaluationSettings,
+    TrainingSettings,
+    require_frames,
+)
 from cnfp_torchrl.training.storage import prepare_buffer
-from cnfp_torchrl.training.update import Update
+from cnfp_torchrl.training.stored_transitions import StoredTransitions
+from cnfp_torchrl.training.update import Update, UpdateBudget
+
+_log = logging.getLogger(__name__)
 
 
-def train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
+def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dict[str, Any]:
     """Train, evaluate and leave everything in the run's folder.
 
     Args:
         config: configuration as composed from ``conf/train.yaml``.
-        folder: an empty run folder.
+        folder: an empty run folder, or that of a run to go on with.
+        resume: go on where the run in the folder was saved last.
 
     Returns:
         The summary that is also written to ``summary.json``.
 
     Raises:
         ValueError: before any work, for a setting that makes no sense.
+        CheckpointError: when the state of the run cannot be written or read.
+        TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved.
     """
     with closing(folder):
-        return _train(config, folder)
+        return _train(config, folder, resume)
 
 
-def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
-    started = time.perf_counter()
+def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any]:
     # Settings
     require_settings(config)
     require_frames(config)
     settings: TrainingSettings = instantiate(config.training)
+    saving: CheckpointSettings = instantiate(config.checkpoint)
     evaluation: EvaluationSettings = instantiate(config.evaluation)
     score: LinearScore | None = instantiate(config.env.get("score"))
     visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
@@ -72,8 +91,9 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     torch.set_num_threads(config.threads)
 
     # Environment, actor and loss
-    env = build_environment(config, with_penalty=True)
+    env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
+    tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
     loss = build_loss(config, env, actor)
     target = instantiate(config.target, _partial_=True)(loss)
@@ -98,63 +118,152 @@ def _train(config: DictConfig, folder: RunFolder) -> dict[str, Any]:
     )
 
     # Callback and loggers
+    state = RunState(folder, saving)
+    if resume:
+        done = state.load()
+        _require_steps_to_go(config, folder, done)
+        state.drop_what_came_after()
+        folder.replace_config(config)
+    _log.info(
+        "training for %s steps, then twice %s episodes of at most %s steps each",
+        config.collector.total_frames,
+        evaluation.episodes,
+        evaluation.max_steps,
+    )
     callback: TrainingCallback = NoCallback()
     if visual is not None:
-        callback = visual.for_training(folder.path / RECORDING, actor, env)
-    folder.save_config(config)
+        recording = folder.new_file(RECORDING) if resume else folder.path / RECORDING
+        callback = visual.for_training(recording, actor, env)
+    if not resume:
+        folder.save_config(config)
     loggers = [
         make(log_dir=str(folder.path)) for make in (instantiate(config.logger) or {}).values()
     ]
     metrics = Metrics(
         [*loggers, *callback.loggers],
-        ConstraintTally.of(env),
+        tally,
         total_frames=config.collector.total_frames,
         interval=settings.log_interval,
     )
 
-    updates_due = 0.0
-    with closing(callback):
-        for collected in collector:
-            callback.on_batch(collected)
-            batch = collected.reshape(-1)
-            metrics.add_steps(batch)
-            buffer.extend(batch.select(*stored))
-            if metrics.frames >= settings.warmup_frames:
-                updates_due += batch.numel() * settings.update_ratio
-                while updates_due >= 1:
-                    metrics.add_losses(update(buffer.sample()))
-                    updates_due -= 1
-            metrics.log_if_due()
-        metrics.finish()
+    # What the run goes on from
+    is_saved = saving.interval is not None
+    transitions = StoredTransitions(buffer, folder.path / STATES, is_saved=is_saved)
+    budget = UpdateBudget(settings.update_ratio)
+    best = BestPolicy(folder, actor=actor, loss=loss, optimizer=optimizer)
+    episodes = CollectorState(collector, env)
+    evaluations = IntervalEvaluation(
+        partial(_evaluation_environment, config, evaluation.interval_episodes),
+        actor,
+        evaluation,
+        score,
+    )
+    state.restore(
+        {
+            "actor": actor,
+            "loss": loss,
+            "optimizer": optimizer,
+            "warm_up": Attributes(policy, "frames_left"),
+            "budget": Attributes(budget, "due"),
+            "best": Attributes(best, "score", "violations"),
+            "evaluations": Attributes(evaluations, "history"),
+            "metrics": metrics,
+            "collector": episodes,
+            "random": GlobalRNGState(),
+        },
+        transitions,
+    )
+    if resume:
+        callback.continue_at(metrics.frames)
+        sys.stderr.write(f"{folder.path}: goes on at step {done}\n")
+        if done and not episodes.resumes_episodes:
+            warnings.warn(
+                f"the episodes that ran at step {done} begin anew: {env.base_env} does not give "
+                "its state",
+                EpisodesBeginAnewWarning,
+                stacklevel=3,
+            )
+
+    with closing(callback), closing(evaluations):
+        with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+            for collected in collector:
+                callback.on_batch(collected)
+                batch = collected.reshape(-1)
+                metrics.add_steps(batch)
+                transitions.extend(batch.select(*stored))
+                if metrics.frames >= settings.warmup_frames:
+                    budget.earn(batch.numel())
+                    while budget.spend():
+                        metrics.add_losses(update(buffer.sample()))
+                metrics.log_if_due()
+                if (report := evaluations.run_if_due(metrics.frames)) is not None:
+                    metrics.add_evaluation(report)
+                    best.offer_evaluation(report)
+                is_last = metrics.frames >= config.collector.total_frames
+                if is_last or stop.signal is not None or state.is_due(metrics.frames):
+                    if evaluation.interval is None:
+                        best.offer(*_training_score(metrics, score))
+                    state.save(metrics.frames)
+                if stop.signal is not None:
+                    raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
+            metrics.finish()
         collector.shutdown()
         # Before anything else that may fail or be interrupted.
         folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
 
         # Evaluation
-        recorders: dict[bool, EpisodeRecorder] = {}
-        if visual is not None:
-            recorders[visual.deterministic] = EpisodeRecorder(first_episodes(visual, evaluation))
         summary = {
-            **_results(metrics, _evaluations(config, actor, evaluation, recorders), score),
+            **_results(metrics, _evaluations(config, actor, evaluation), score),
+            "evaluations_in_training": evaluations.history,
             "steps": metrics.frames,
-            "seconds": time.perf_counter() - started,
+            "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
-            "order": application_order(config),
+            "order": flow_head(actor).order,
             "seed": config.seed,
         }
         folder.save_summary(summary)
+        state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
-        for recorder in recorders.values():
-            for episode in recorder.episodes.values():
-                callback.on_episode(episode)
+        if visual is not None:
+            with closing(
+                build_environment(config, batch_size=[1], device=config.device, with_anchor=True)
+            ) as one:
+                give_episodes(callback, visual, evaluation, one, actor)
     return summary
+
+
+def _require_steps_to_go(config: DictConfig, folder: RunFolder, done: int) -> None:
+    """Refuse to go on with a finished run that is not extended, or whose states are gone."""
+    if not folder.is_finished:
+        return
+    if not done:
+        raise ValueError(
+            f"resume: expected a run with states to go on from, but {folder.path / STATES} of this "
+            "finished one has none; train again with checkpoint.keep_last=true"
+        )
+    if done >= config.collector.total_frames:
+        raise ValueError(
+            f"resume: expected a run that was stopped, given {folder.path}, which has finished "
+            f"with {done} steps; to extend it, add collector.total_frames=N with more of them"
+        )
+
+
+def _training_score(metrics: Metrics, score: LinearScore | None) -> tuple[float, int]:
+    """Return the score of the last episodes of training, and all violations so far."""
+    violations = sum(count or 0 for count in violations_of(metrics.counts()).values())
+    last = metrics.last_return
+    return last if score is None else score(last), violations
+
+
+def _evaluation_environment(config: DictConfig, episodes: int) -> TransformedEnv:
+    """Return an environment for some episodes, without a penalty, on the device of training."""
+    return build_environment(config, batch_size=[episodes], device=config.device)
 
 
 def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
     settings: EvaluationSettings,
-    recorders: Mapping[bool, EpisodeRecorder],
 ) -> dict[str, Evaluation]:
     """Evaluate the stochastic policy and the deterministic one.
 
@@ -162,18 +271,12 @@ def _evaluations(
         config: that of the run.
         actor: the trained actor.
         settings: number of episodes and the seed.
-        recorders: what keeps episodes, by whether the policy is deterministic.
     """
-    return {
-        name: evaluate_seeded(
-            build_environment(config, batch_size=[settings.episodes]),
-            guarded(actor),
-            settings,
-            deterministic=deterministic,
-            on_step=recorders.get(deterministic),
-        )
-        for name, deterministic in {"stochastic": False, "deterministic": True}.items()
-    }
+    with closing(_evaluation_environment(config, settings.episodes)) as env:
+        return {
+            name: evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic)
+            for name, deterministic in {"stochastic": False, "deterministic": True}.items()
+        }
 
 
 def _results(

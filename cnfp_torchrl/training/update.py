@@ -9,6 +9,30 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 
+class UpdateBudget:
+    """The number of updates that are due, which need not be whole.
+
+    Args:
+        ratio: updates for each environment step.
+    """
+
+    def __init__(self, ratio: float) -> None:
+        self._ratio = ratio
+        self.due = 0.0
+        """The number of updates that are due."""
+
+    def earn(self, frames: int) -> None:
+        """Add the updates of environment steps."""
+        self.due += frames * self._ratio
+
+    def spend(self) -> bool:
+        """Take one update off, if a whole one is due, and tell whether it was."""
+        if self.due < 1:
+            return False
+        self.due -= 1
+        return True
+
+
 class Update:
     """A step of learning from a batch of transitions.
 

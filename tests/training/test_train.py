@@ -119,6 +119,8 @@ def test_no_logger_is_fine(tiny_run: Run) -> None:
     assert {path.name for path in folder.path.iterdir()} == {
         "config.yaml",
         "checkpoint.pt",
+        "best.pt",
+        "checkpoints",
         "summary.json",
     }
 

@@ -22,7 +22,6 @@ def maximize_slack_by_cuts(
     trial: Tensor,
     counts: Tensor,
     start: Tensor,
-    scale: Tensor,
     settled: Settled,
 ) -> Best:
     r"""Do what `maximize_slack` does with further sets, of which only the slack is known.
@@ -39,12 +38,10 @@ def maximize_slack_by_cuts(
         trial: flags of the sets on trial, boolean ``(B, len(sets))``.
         counts: flags of the sets that count, boolean ``(B, len(sets))``.
         start: points strictly inside of all that must hold, ``(B, d)``.
-        scale: mean widths of the action bounds, ``(B,)``.
         settled: function that tells which problems need no more work.
     """
-    found = Best(
-        start.clone(), torch.full_like(scale, -torch.inf), torch.full_like(scale, torch.inf)
-    )
+    least = torch.full_like(start[:, 0], -torch.inf)
+    found = Best(start.clone(), least, -least)
     left = torch.arange(len(start), device=start.device)
     for _ in range(MAX_CUTS):
         at, needs, tried, on = start[left], required[left], trial[left], counts[left]
@@ -55,7 +52,7 @@ def maximize_slack_by_cuts(
             lowest = found.slack[total]
             return (lower - lowest >= (upper - lowest) / 2) | settled(lower, upper, total)
 
-        best = maximize_slack(problem, at, scale[left], half_settled)
+        best = maximize_slack(problem, at, half_settled)
         slacks, gradients = _linearized(sets, left, len(start), best.action)
         rooms, rooms_at_start = (
             torch.where(on, slack - needs, torch.inf)
@@ -75,7 +72,7 @@ def maximize_slack_by_cuts(
         if not bool(undecided.any()):
             break
         offsets = slacks - needs - (gradients * best.action.unsqueeze(-2)).sum(-1)
-        problem = problem.with_rows(-gradients, offsets, tried.to(slacks), on)
+        problem = problem.with_rows(-gradients, offsets, tried, on)
         problem, left = problem.select(undecided), left[undecided]
     return found
 

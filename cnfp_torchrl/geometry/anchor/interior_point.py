@@ -1,26 +1,32 @@
-"""A batched interior-point method for the largest smallest slack of several convex sets.
+r"""A batched primal-dual interior-point method for the largest smallest slack of convex sets.
 
-Path-following with the logarithmic barrier: for growing eta, Newton's method minimizes
-``-eta t + barrier(a, t)``. Every iterate is strictly feasible, so its slack is a lower bound of the
-best one; a small Newton decrement certifies an upper bound (Nesterov, Introductory Lectures on
-Convex Optimization, 2004, theorem 4.2.7).
+Newton's method goes towards :math:`s \circ z = \mu`, with the slacks s of rows and cones and their
+weights z, scaled such that both are the same vector (Nesterov and Todd 1997). Predictor and
+corrector share one factorization (Mehrotra 1992; for cones: Vandenberghe, The CVXOPT linear and
+quadratic cone program solvers, 2010).
+
+Every point on the way is strictly feasible, so its slack is a lower bound of the best one. Whatever
+the weights are, they certify an upper bound, by weak duality, with what their gradients leave over
+bounded over the action bounds: no bound rests on convergence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
-from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program
+from cnfp_torchrl.geometry.anchor.program import Program
 
-MAX_ITERATIONS = 150
-"""The number of Newton steps after which the best point so far is taken; 15 are usual, 50 rare."""
+MAX_ITERATIONS = 60
+"""The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
 
-_GROWTH = 20.0
-_TRIALS = 6
+_FRACTION = 0.995
+"""The share of the way to the boundary that a step may go."""
 
 
 class Best(NamedTuple):
@@ -35,195 +41,254 @@ Settled: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
 """From lower and upper bounds of the best t, and the problems' indices: which need no more work."""
 
 
-def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Settled) -> Best:
+def maximize_slack(problem: Program, start: Tensor, settled: Settled) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
     Stops for each problem as soon as its bounds say enough: at once where a set is so far from the
-    bounds that its Lipschitz slack does, which Newton's method could not tell from rounding error.
-    Where rounding error keeps the bounds apart, the best point so far is returned: its slack is
-    true, and no more is claimed for the upper bound.
+    bounds that the largest slack within them does, which Newton's method could not tell from
+    rounding error. Where rounding error keeps the bounds apart, the best point so far is returned:
+    its slack is true, and no more is claimed for the upper bound.
 
     Args:
         problem: B problems in float64, with rows that bound the actions on all sides.
-        start: points strictly inside of the inequalities of rate 0, ``(B, d)``.
-        scale: mean widths of the bounds, ``(B,)``.
+        start: points strictly inside of what is not on trial, ``(B, d)``.
         settled: function that tells which problems need no more work.
     """
-    at = problem.start(start, scale)
-    # The bounds' diagonal at most; outside of the bounds nothing is feasible.
-    upper_bound = problem.bound_within(start, scale * start.shape[-1])
-    found = Best(start.clone(), problem.slack(start), upper_bound)
-    # The eta for which the start is best in t.
-    eta = _pull_on_slack(problem, at)
-    nu = float(problem.barrier_parameter())
+    unit = problem.unit.squeeze(-1)
+    x = problem.start(start)
+    found, largest, bound = x.clone(), torch.empty_like(unit), torch.empty_like(unit)
     left = torch.arange(len(start), device=start.device)
-    lower, upper, action = found.slack, upper_bound, at.action
-    for _ in range(MAX_ITERATIONS):
-        undecided = ~settled(lower, upper, left)
-        if not bool(undecided.all()):
-            found = _settle(found, left, lower, upper, action)
-            if not bool(undecided.any()):
-                return found
-            problem, left = problem.select(undecided), left[undecided]
-            lower, upper, action = lower[undecided], upper[undecided], action[undecided]
-            eta, at = eta[undecided], Point(*(variable[undecided] for variable in at))
-        distances = problem.distances(at)
-        slack = at.slack + problem.gained(distances)
-        action = torch.where((slack > lower).unsqueeze(-1), at.action, action)
-        lower = torch.maximum(slack, lower)
-        move, squared = newton(problem, at, distances, eta)
-        # The absolute value, because a negative one is all rounding error.
-        decrement = squared.abs().sqrt()
-        near = decrement < 0.5
-        gap = (nu + (decrement + nu**0.5) * decrement / (1 - decrement)) / eta
-        upper = torch.minimum(upper, torch.where(near, at.slack + gap, torch.inf))
-        at = _line_search(problem, at, move, eta, decrement)
-        eta = torch.where(near, eta * _GROWTH, eta)
-    return _settle(found, left, lower, upper, action)
+    path = _Path.begin(problem, x)
+    lower, upper, best = x[:, problem.dim, 0] + 1, problem.bound(), x
+    for iteration in range(MAX_ITERATIONS + 1):
+        scale = unit[left]
+        undecided = ~settled(lower * scale, upper * scale, left)
+        count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
+        if count <= len(left) // 2:
+            # Until then those that are settled go on with the others, but count no more.
+            found = found.index_copy(0, left, best)
+            largest = largest.index_copy(0, left, lower * scale)
+            bound = bound.index_copy(0, left, upper * scale)
+            if not count:
+                break
+            path, left, best = path.select(undecided), left[undecided], best[undecided]
+            lower, upper = lower[undecided], upper[undecided]
+            undecided = undecided[undecided]
+        slack, height = path.slacks()
+        least, above, product = path.bounds(slack, height)
+        better = undecided & (least > lower)
+        best = torch.where(better[:, None, None], path.x, best)
+        lower = torch.where(better, least, lower)
+        upper = torch.where(undecided & (above < upper), above, upper)
+        path.advance(slack, height, product)
+    return Best(problem.action(found), largest, bound)
 
 
-def _settle(found: Best, index: Tensor, lower: Tensor, upper: Tensor, action: Tensor) -> Best:
-    """Return what was found with the bounds and actions of some of the problems."""
-    return Best(
-        found.action.index_copy(0, index, action),
-        found.slack.index_copy(0, index, lower),
-        found.upper_bound.index_copy(0, index, upper),
-    )
-
-
-def newton(problem: Program, at: Point, distances: Distances, eta: Tensor) -> tuple[Point, Tensor]:
-    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``.
+@dataclass(eq=False)
+class _Path:
+    """Points and weights of B problems on their way.
 
     Args:
-        problem: B problems.
-        at: strictly feasible points.
-        distances: distances of these points from the inequalities.
-        eta: weights of t, ``(B,)``.
-    """
-    inverse = distances.rows.reciprocal().unsqueeze(-1)
-    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
-    gradient, hessian = rows.sum(-2), rows.mT @ rows
-    gradient[:, -1] -= eta
-    if problem.has_cones:
-        _add_cones(problem, at, distances, gradient, hessian)
-    if not problem.has_sums:
-        move = -_solve(hessian, gradient)
-        return Point(move[:, :-1], move[:, -1], at.terms), -(gradient * move).sum(-1)
-    sums = _KinkedSums.at(problem, distances)
-    own, eliminated = sums.gradients()
-    hessian = hessian + sums.reduced_hessian()
-    move = -_solve(hessian, gradient + own - eliminated)
-    terms = sums.move_of_terms(move)
-    decrement = -((gradient + own) * move).sum(-1) - (sums.gradient * terms).sum((-2, -1))
-    return Point(move[:, :-1], move[:, -1], terms), decrement
-
-
-def _add_cones(
-    problem: Program, at: Point, s: Distances, gradient: Tensor, hessian: Tensor
-) -> None:
-    """Add the barriers of cones, ``-log(h^2 - |y|^2)``, to gradient and Hessian in (action, t)."""
-    white = problem.white(at.action)
-    height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    inverse = 2 / (s.cone_gaps * s.cone_sums)
-    # Half of the gradient times h^2 - |y|^2.
-    pulled = (problem.matrices * white.unsqueeze(-1)).sum(-2)
-    z = torch.cat([pulled, (height * problem.cone_rates).unsqueeze(-1)], -1)
-    z = z * inverse.unsqueeze(-1)
-    gradient += z.sum(-2)
-    hessian += z.mT @ z
-    matrices = (problem.matrices * inverse.sqrt()[..., None, None]).flatten(1, 2)
-    hessian[:, :-1, :-1] += matrices.mT @ matrices
-    hessian[:, -1, -1] -= (inverse * problem.cone_rates.square()).sum(-1)
-
-
-class _KinkedSums(NamedTuple):
-    """Barriers of kinked sums, whose terms' bounds u are eliminated: diagonal plus rank one.
-
-    The Hessian in u is ``diag(curvature) + r^2 1 1^T``, that of u and the action ``-diag(pull)``,
-    that of u and the slack ``r^2 rates``.
+        rows: rows of the program, ``(B, M, n)``.
+        offsets: their offsets, ``(B, M, 1)``.
+        cones: cones of the program, ``(B, J, 1 + k, n)``.
+        tips: their constants, ``(B, J, 1 + k, 1)``.
+        spare: 0 for what is on trial and infinite for the others, ``(B, M + J, 1)``.
+        low: least values of all unknowns but t, ``(B, n, 1)``.
+        high: largest values of all unknowns but t, ``(B, n, 1)``.
+        x: unknowns, ``(B, n, 1)``.
+        weights: weights of the rows, ``(B, M, 1)``.
+        duals: weights of the cones, ``(B, J, 1 + k, 1)``.
+        dim: number d of components of an action, after which t stands in x.
     """
 
-    problem: Program
-    p: Tensor
-    q: Tensor
-    r: Tensor
-    curvature: Tensor
-    pull: Tensor
-    gradient: Tensor
-    kappa: Tensor
+    rows: Tensor
+    offsets: Tensor
+    cones: Tensor
+    tips: Tensor
+    spare: Tensor
+    low: Tensor
+    high: Tensor
+    x: Tensor
+    weights: Tensor
+    duals: Tensor
+    dim: int
 
     @classmethod
-    def at(cls, problem: Program, s: Distances) -> Self:
-        p, q, r = s.upper.reciprocal(), s.lower.reciprocal(), s.sums.reciprocal()
-        curvature = p.square() + q.square()
-        kappa = r.square() / (1 + r.square() * curvature.reciprocal().sum(-1))
-        pull = problem.upper * p.square() + problem.lower * q.square()
-        return cls(problem, p, q, r, curvature, pull, r.unsqueeze(-1) - p - q, kappa)
+    def begin(cls, problem: Program, x: Tensor) -> Self:
+        """Return the paths from points on, with weights for which the points are best in t."""
+        dim, reach = problem.dim, problem.term_reach.unsqueeze(-1)
+        one, zero = torch.ones_like(x[:, :dim]), torch.zeros_like(x[:, :1])
+        rates = torch.cat([problem.rows[:, :, dim], problem.cones[:, :, 0, dim]], 1).unsqueeze(-1)
+        path = cls(
+            rows=problem.rows,
+            offsets=problem.offsets,
+            cones=problem.cones,
+            tips=problem.tips,
+            spare=torch.zeros_like(rates).masked_fill(rates == 0, torch.inf),
+            low=torch.cat([-one, zero, torch.zeros_like(reach)], 1),
+            high=torch.cat([one, zero, 2 * reach], 1),
+            x=x,
+            weights=problem.offsets,
+            duals=problem.tips,
+            dim=dim,
+        )
+        slack, height = path.slacks()
+        weights, duals = slack.reciprocal(), _flipped(height) / _det(height)
+        pull = (torch.cat([weights, duals[:, :, 0]], 1) * rates).sum(1, keepdim=True)
+        path.weights, path.duals = weights / pull, duals / pull.unsqueeze(1)
+        return path
 
-    def solve(self, right: Tensor) -> Tensor:
-        """Solve with the Hessian in u, by Sherman and Morrison."""
-        scaled = right / self.curvature
-        return scaled - (self.kappa * scaled.sum(-1)).unsqueeze(-1) / self.curvature
+    def select(self, keep: Tensor) -> Self:
+        """Return some of the B paths."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return type(self)(**{n: v if n == "dim" else v[keep] for n, v in values.items()})
 
-    def gradients(self) -> tuple[Tensor, Tensor]:
-        """Return the gradient in (action, slack), and what elimination takes off it."""
-        upper, lower, rates = self.problem.upper, self.problem.lower, self.problem.sum_rates
-        own = _joined((upper * self.p + lower * self.q).sum(-2), (rates * self.r).sum(-1))
-        relaxed = self.solve(self.gradient)
-        slack = (rates * self.r.square() * relaxed.sum(-1)).sum(-1)
-        return own, _joined(-(self.pull * relaxed).sum(-2), slack)
+    def slacks(self) -> tuple[Tensor, Tensor]:
+        """Return the slacks of rows ``(B, M, 1)`` and of cones ``(B, J, 1 + k, 1)``."""
+        slack = torch.baddbmm(self.offsets, self.rows, self.x, alpha=-1)
+        if not self.cones.shape[1]:
+            return slack, self.tips
+        return slack, self.tips - self.cones @ self.x.unsqueeze(1)
 
-    def reduced_hessian(self) -> Tensor:
-        """Return the Schur complement in (action, slack)."""
-        spread = self.p * self.q * (self.problem.upper - self.problem.lower)
-        row = _joined(self.pull / self.curvature, self.problem.sum_rates)
-        diagonal = (spread.square() / self.curvature).sum(-2)
-        diagonal = _joined(diagonal, torch.zeros_like(diagonal[:, 0]))
-        return torch.diag_embed(diagonal) + (row * self.kappa.unsqueeze(-1)).mT @ row
+    def bounds(self, slack: Tensor, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return bounds of the best t, ``(B,)`` each, and the weighted sums of all slacks."""
+        rooms, pull = slack, self.rows.mT @ self.weights
+        product = slack.mT @ self.weights
+        if self.cones.shape[1]:
+            rooms = torch.cat([slack, height[:, :, 0] - vector_norm(height[:, :, 1:], dim=2)], 1)
+            product = product + (height * self.duals).sum((1, 2)).unsqueeze(-1)
+            pull = pull + (self.cones.mT @ self.duals).sum(1)
+        # What the weighted mean of all slacks may become within the bounds.
+        rest = torch.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
+        rest[:, self.dim] = product.squeeze(-1)
+        t = self.x[:, self.dim, 0]
+        upper = t + (rest.sum(1) / pull[:, self.dim]).squeeze(-1)
+        return t + (rooms + self.spare).amin((1, 2)), upper, product
 
-    def move_of_terms(self, move: Tensor) -> Tensor:
-        """Return the Newton direction of u that goes with one of (action, slack)."""
-        slack = self.problem.sum_rates * self.r.square() * move[:, -1:]
-        pulled = self.pull * move[:, None, :-1] - slack.unsqueeze(-1)
-        return self.solve(pulled - self.gradient)
+    def advance(self, slack: Tensor, height: Tensor, product: Tensor) -> None:
+        """Take a step, from slacks and their weighted sums."""
+        count = slack.shape[1]
+        root = (self.weights / slack).sqrt()
+        scaled, point = self.rows * root, slack * root
+        scaling = ConeScaling.between(height, self.duals) if self.cones.shape[1] else None
+        if scaling is not None:
+            scaled = torch.cat([scaled, scaling.unscaled(self.cones).flatten(1, 2)], 1)
+            point = torch.cat([point, scaling.scaled(self.duals).flatten(1, 2)], 1)
+        factor = _factor(scaled.mT @ scaled)
+        goal = torch.zeros_like(self.x)
+        goal[:, self.dim] = 1
+        fall = scaled @ torch.cholesky_solve(goal, factor)
+        share = 1 / torch.maximum(*self._limits(point, fall, point - fall)).clamp(min=1)
+        # The less a step without centering would gain, the more centering there is.
+        center = (1 - share) ** 3 * (product / (count + self.cones.shape[1]))
+        squared = fall * (fall - point)
+        aim = (center + squared[:, :count]) / point[:, :count]
+        if scaling is not None:
+            own, falls = (v[:, count:].view_as(height) for v in (point, fall))
+            wanted = _product(falls, falls - own)
+            wanted[:, :, :1] += center.unsqueeze(1)
+            aim = torch.cat([aim, _quotient(wanted, own).flatten(1, 2)], 1)
+        move = torch.cholesky_solve(torch.baddbmm(goal, scaled.mT, aim, alpha=-1), factor)
+        fall = scaled @ move
+        loss = point - aim - fall
+        limits = self._limits(point, fall, loss)
+        if scaling is not None:
+            limits = (torch.maximum(*limits),) * 2
+        ahead, along = (_FRACTION / limit.clamp(min=_FRACTION) for limit in limits)
+        self.x = torch.addcmul(self.x, ahead, move)
+        self.weights = torch.addcmul(self.weights, along, root * loss[:, :count], value=-1)
+        if scaling is not None:
+            change = scaling.unscaled(loss[:, count:].view_as(height))
+            self.duals = torch.addcmul(self.duals, along.unsqueeze(1), change, value=-1)
+
+    def _limits(self, point: Tensor, fall: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inverse of the largest steps of slacks and weights, ``(B, 1, 1)`` each.
+
+        Args:
+            point: slacks, which are as large as the weights, in the scaling of the step.
+            fall: what a step takes off the slacks.
+            loss: what a step takes off the weights.
+        """
+        count, changes = self.rows.shape[1], torch.stack([fall, loss])
+        limits = (changes[:, :, :count] / point[:, :count]).amax(2, keepdim=True)
+        if self.cones.shape[1]:
+            changes = changes[:, :, count:].unflatten(2, self.duals.shape[1:3])
+            own = point[:, count:].view_as(self.duals)
+            # A cone is left where own - step * changes has a determinant of 0, a quadratic.
+            det, along = _det(own), _dot(_flipped(own), changes)
+            squared = _dot(_flipped(changes), changes)
+            steepest = (along + (along.square() - squared * det).relu().sqrt()) / det
+            limits = torch.maximum(limits, steepest.amax(2))
+        return limits[0], limits[1]
 
 
-def _joined(action: Tensor, slack: Tensor) -> Tensor:
-    return torch.cat([action, slack.unsqueeze(-1)], -1)
+class ConeScaling(NamedTuple):
+    r"""The scaling of cones in which a slack s is as large as its weight z.
+
+    :math:`W = \eta\,(2 v v^T - J)` with :math:`W z = W^{-1} s`, and W's root w as its axis.
+    """
+
+    head: Tensor
+    tail: Tensor
+    size: Tensor
+
+    @classmethod
+    def between(cls, slack: Tensor, weight: Tensor) -> Self:
+        """Return the scaling for slacks and weights ``(B, J, 1 + k, 1)`` inside of the cones."""
+        of_slack, of_weight = _det(slack), _det(weight)
+        s, z = slack * of_slack.rsqrt(), weight * of_weight.rsqrt()
+        axis = (s + _flipped(z)) * (2 + 2 * _dot(s, z)).rsqrt()
+        return cls(axis[:, :, :1], axis[:, :, 1:], (of_slack / of_weight) ** 0.25)
+
+    def scaled(self, v: Tensor) -> Tensor:
+        """Return W v."""
+        first, dot = v[:, :, :1], _dot(self.tail, v[:, :, 1:])
+        rest = v[:, :, 1:] + (first + dot / (1 + self.head)) * self.tail
+        return self.size * torch.cat([self.head * first + dot, rest], 2)
+
+    def unscaled(self, v: Tensor) -> Tensor:
+        """Return the inverse of W times v."""
+        first, dot = v[:, :, :1], _dot(self.tail, v[:, :, 1:])
+        rest = v[:, :, 1:] + (dot / (1 + self.head) - first) * self.tail
+        return torch.cat([self.head * first - dot, rest], 2) / self.size
 
 
-def _pull_on_slack(problem: Program, at: Point) -> Tensor:
-    s = problem.distances(at)
-    pull = (problem.row_rates / s.rows).sum(-1)
-    if problem.has_cones:
-        height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-        pull = pull + (2 * height * problem.cone_rates / (s.cone_gaps * s.cone_sums)).sum(-1)
-    if problem.has_sums:
-        pull = pull + (problem.sum_rates / s.sums).sum(-1)
-    return pull
+def _dot(u: Tensor, v: Tensor) -> Tensor:
+    return (u * v).sum(-2, keepdim=True)
 
 
-def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decrement: Tensor) -> Point:
-    """Take the best step between the damped Newton step, which always helps, and a full one."""
-    share = torch.linspace(1, 0, _TRIALS, dtype=eta.dtype, device=eta.device).unsqueeze(-1)
-    steps = (1 + decrement) ** -share
-    trials = at.moved(move, steps)
-    value = problem.barrier(problem.distances(trials)) - eta * (steps * move.slack)
-    best = steps.gather(0, value.argmin(0, keepdim=True)).squeeze(0)
-    return at.moved(move, best)
+def _flipped(v: Tensor) -> Tensor:
+    """Return vectors ``(..., 1 + k, 1)`` with the sign of all but their first component changed."""
+    return torch.cat([v[..., :1, :], -v[..., 1:, :]], -2)
 
 
-def _solve(hessian: Tensor, right: Tensor) -> Tensor:
-    """Solve with a positive definite matrix, scaled to a unit diagonal."""
-    scale = hessian.diagonal(dim1=-2, dim2=-1).rsqrt()
-    scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
-    factor, failed = torch.linalg.cholesky_ex(scaled)
+def _det(v: Tensor) -> Tensor:
+    """Return the square of the first component less that of the length of the others."""
+    length = vector_norm(v[..., 1:, :], dim=-2, keepdim=True)
+    return (v[..., :1, :] - length) * (v[..., :1, :] + length)
+
+
+def _product(u: Tensor, v: Tensor) -> Tensor:
+    """Return the Jordan product of vectors of cones."""
+    rest = u[:, :, :1] * v[:, :, 1:] + v[:, :, :1] * u[:, :, 1:]
+    return torch.cat([_dot(u, v), rest], 2)
+
+
+def _quotient(u: Tensor, v: Tensor) -> Tensor:
+    """Return what gives u when multiplied by v, by the Jordan product."""
+    first = _dot(_flipped(v), u) / _det(v)
+    return torch.cat([first, (u[:, :, 1:] - first * v[:, :, 1:]) / v[:, :, :1]], 2)
+
+
+def _factor(hessian: Tensor) -> Tensor:
+    """Return the Cholesky factor of matrices that are positive definite but for rounding."""
+    factor, failed = torch.linalg.cholesky_ex(hessian)
     if bool(failed.any()):
-        # Rounding made a matrix indefinite; a shift of that size gives a descent direction, and
-        # where not even that helps, the diagonal does.
-        identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        shifted, hopeless = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
-        shifted = torch.where((hopeless > 0)[:, None, None], identity, shifted)
+        # A shift of the size of the rounding gives a direction in which t grows, and where not even
+        # that helps, the diagonal does.
+        diagonal = torch.diag_embed(hessian.diagonal(dim1=-2, dim2=-1))
+        shifted, hopeless = torch.linalg.cholesky_ex(hessian + 1e-9 * diagonal)
+        shifted = torch.where((hopeless > 0)[:, None, None], diagonal.sqrt(), shifted)
         factor = torch.where((failed > 0)[:, None, None], shifted, factor)
-    right = (right * scale).unsqueeze(-1)
-    return (torch.cholesky_solve(right, factor).squeeze(-1) * scale).nan_to_num()
+    return factor

@@ -57,14 +57,14 @@ class Intersection:
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
         middle = (bounds.low + bounds.high) / 2
         widths = tuple(int(s.row_slacks(middle).shape[-1]) for s in wide)
-        program, described, plain = _described(wide, widths, near, len(middle))
+        program, described, plain = _described(wide, widths, near)
         return cls(wide, widths, program, described, plain)
 
     def near(self, point: Tensor) -> Self:
         """Return the intersections with the convex parts near points ``(B, d)`` in their place."""
         if all(self.convex):
             return self
-        program, described, plain = _described(self.sets, self.widths, point, len(point))
+        program, described, plain = _described(self.sets, self.widths, point)
         return type(self)(self.sets, self.widths, program, described, plain)
 
     @property
@@ -111,13 +111,10 @@ class Intersection:
             start: points strictly inside of what the rows not on trial require, ``(B, d)``.
             settled: tells which problems need no more work.
         """
-        bounds = self.bounds
-        scale = (bounds.high - bounds.low).mean(-1)
-        tried, counted = trial.to(required), counts.to(required)
         at = self.described
-        problem = self.program.requiring(required[:, at], tried[:, at], counted[:, at])
+        problem = self.program.requiring(required[:, at], trial[:, at], counts[:, at])
         if not self.plain:
-            return maximize_slack(problem, start, scale, settled)
+            return maximize_slack(problem, start, settled)
         sets = [self.sets[i] for i in self.plain]
         rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(
@@ -127,18 +124,17 @@ class Intersection:
             trial[:, rows],
             counts[:, rows],
             start,
-            scale,
             settled,
         )
 
 
 def _described(
-    sets: Sequence[ConstraintSet], widths: Sequence[int], near: Tensor | None, batch: int
+    sets: Sequence[ConstraintSet], widths: Sequence[int], near: Tensor | None
 ) -> tuple[Program, Tensor, tuple[int, ...]]:
     """Return the program, the row of each of its inequalities, and the sets left out of it."""
     parts = [s.superlevel() if near is None else s.part_near(near) for s in sets]
     known = [part for part in parts if part is not None]
-    owners: dict[type[Superlevel], list[int]] = {Rows: [], Cone: [], KinkedSum: []}
+    owners: dict[type[Superlevel], list[int]] = {KinkedSum: [], Rows: [], Cone: []}
     first = 0
     for part, width in zip(parts, widths, strict=True):
         if part is not None:
@@ -146,7 +142,9 @@ def _described(
             # One inequality for each row, or several that make up a single one.
             owners[type(part)] += [first + (i if count == width else 0) for i in range(count)]
         first += width
-    described = torch.tensor(owners[Rows] + owners[Cone] + owners[KinkedSum])
+    described = torch.tensor(owners[KinkedSum] + owners[Rows] + owners[Cone])
     plain = tuple(i for i, part in enumerate(parts) if part is None)
     device = next(iter(sets[0].fields().values())).device
-    return Program.stack(known, batch), described.to(device), plain
+    bounds = sets[0]
+    assert isinstance(bounds, Box)
+    return Program.stack(known, bounds), described.to(device), plain

@@ -1,259 +1,241 @@
-"""Problems of the largest smallest slack: stacks of rows, cones and kinked sums, and barriers."""
+r"""Problems of the largest smallest slack, as rows and second-order cones in one vector x.
+
+A problem's unknowns are :math:`x = (a, t, u)`: the action in half widths of the bounds about their
+middle, the slack t in mean half widths, and bounds u of the terms of kinked sums, of which each
+makes two rows, :math:`\alpha_i a_i \le u_i` and :math:`\beta_i a_i \le u_i`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 from torch.nn.functional import pad
 
-from cnfp_torchrl.geometry.norms import spectral_norm_bound
+from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
-
-
-class Point(NamedTuple):
-    """Primal variables: action ``(B, d)``, slack ``(B,)``, kinked terms' bounds ``(B, L, d)``."""
-
-    action: Tensor
-    slack: Tensor
-    terms: Tensor
-
-    def moved(self, by: Point, step: Tensor) -> Point:
-        """Return the point at a step ``(*trials, B)`` along a direction."""
-        along = step.unsqueeze(-1)
-        return Point(
-            self.action + along * by.action,
-            self.slack + step * by.slack,
-            self.terms + along.unsqueeze(-1) * by.terms,
-        )
-
-
-class Distances(NamedTuple):
-    """Distances of a point from each inequality: rows, cones' two factors, kinked sums' three."""
-
-    rows: Tensor
-    cone_gaps: Tensor
-    cone_sums: Tensor
-    upper: Tensor
-    lower: Tensor
-    sums: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """B problems "maximize t such that all sets have slack t", as stacks of rows, cones and sums.
+    """B problems "maximize t such that all sets have slack t".
 
-    Fields carry B first. An inequality has a rate of 0 where it must hold whatever t is. One that
-    does not count has no coefficients, a size of 1 and a rate of 0: it holds by 1 everywhere.
+    Fields carry B first. All slacks grow at the rate of one: a row or cone with a 0 for t must hold
+    whatever t is. One that does not count has no coefficients, and holds by 1 everywhere.
+
+    Args:
+        rows: coefficients of ``rows @ x <= offsets``, ``(B, M, n)``: the terms of kinked sums, the
+            sums, and other rows.
+        offsets: offsets of the rows, ``(B, M, 1)``.
+        loose: offsets that let every action pass, for rows that do not count, ``(B, M, 1)``.
+        cones: coefficients of ``tips - cones @ x``, whose first component is no less than the norm
+            of the others, ``(B, J, 1 + k, n)``.
+        tips: constants of the cones, ``(B, J, 1 + k, 1)``.
+        middle: middles of the bounds, ``(B, d)``.
+        half: half widths of the bounds, ``(B, d)``.
+        unit: mean half widths, ``(B, 1)``.
+        term_reach: half of the ranges within which the terms of sums lie, ``(B, n - d - 1)``; these
+            begin at 0.
     """
 
     rows: Tensor
-    row_offsets: Tensor
-    row_rates: Tensor
-    matrices: Tensor
-    vectors: Tensor
-    cone_sizes: Tensor
-    cone_rates: Tensor
-    upper: Tensor
-    lower: Tensor
-    sum_sizes: Tensor
-    sum_rates: Tensor
+    offsets: Tensor
+    loose: Tensor
+    cones: Tensor
+    tips: Tensor
+    middle: Tensor
+    half: Tensor
+    unit: Tensor
+    term_reach: Tensor
 
     @classmethod
-    def stack(cls, parts: Sequence[Superlevel], batch: int) -> Self:
-        """Stack descriptions, each with batch shape ``(B,)``: all rows, all cones, all sums.
+    def stack(cls, parts: Sequence[Superlevel], bounds: Box) -> Self:
+        """Stack descriptions, each with batch shape ``(B,)``: kinked sums, rows and cones.
 
         Args:
             parts: descriptions, one for each set, at least one of them with rows.
-            batch: number B of problems.
+            bounds: finite bounds of the actions, ``(B, d)``.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
         sums = [part for part in parts if isinstance(part, KinkedSum)]
-        like, dim = rows[0].normals, rows[0].normals.shape[-1]
-        height = max((part.matrix.shape[-2] for part in cones), default=0)
-
-        def joined(pieces: list[Tensor], *shape: int) -> Tensor:
-            """Concatenate pieces ``(*B, ...)`` along their first event dimension."""
-            if not pieces:
-                return like.new_zeros(batch, 0, *shape)
-            sizes = [piece.shape[-1 - len(shape) :] for piece in pieces]
-            return torch.cat([p.expand(batch, *n) for p, n in zip(pieces, sizes, strict=True)], 1)
-
-        program = cls(
-            rows=joined([p.normals for p in rows], dim),
-            row_offsets=joined([p.offsets for p in rows]),
-            row_rates=joined([p.rates for p in rows]),
-            matrices=joined(
-                [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p in cones], height, dim
-            ),
-            vectors=joined(
-                [_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height
-            ),
-            cone_sizes=joined([p.size[..., None] for p in cones]),
-            cone_rates=joined([p.rate[..., None] for p in cones]),
-            upper=joined([torch.maximum(p.upper, p.lower)[..., None, :] for p in sums], dim),
-            lower=joined([torch.minimum(p.upper, p.lower)[..., None, :] for p in sums], dim),
-            sum_sizes=joined([p.size[..., None] for p in sums]),
-            sum_rates=joined([p.rate[..., None] for p in sums]),
+        batch, dim = bounds.low.shape
+        middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
+        unit = half.mean(-1, keepdim=True)
+        width, terms = dim + 1 + len(sums) * dim, len(sums) * dim
+        stacked = middle.new_zeros(batch, 2 * terms + len(sums), width)
+        offsets = torch.zeros_like(stacked[..., 0])
+        reaches = [middle.new_zeros(batch, 0)]
+        for i, part in enumerate(sums):
+            rate = (part.rate.masked_fill(part.rate == 0, 1) * unit.squeeze(-1)).unsqueeze(-1)
+            own = slice(dim + 1 + i * dim, dim + 1 + (i + 1) * dim)
+            for j, slope in enumerate((part.upper / rate, part.lower / rate)):
+                first = j * terms + i * dim
+                stacked[:, first : first + dim, :dim] = torch.diag_embed(slope * half)
+                stacked[:, first : first + dim, own] = -torch.eye(dim).to(middle)
+                offsets[:, first : first + dim] = -slope * middle
+            stacked[:, 2 * terms + i, own] = 1
+            size = (part.size.unsqueeze(-1) / rate).squeeze(-1)
+            offsets[:, 2 * terms + i] = torch.where(part.rate > 0, size, torch.inf)
+            steepest = torch.maximum(part.upper.abs(), part.lower.abs()) / rate
+            reaches.append(steepest * torch.maximum(bounds.low.abs(), bounds.high.abs()) / 2)
+        reach = torch.cat(reaches, -1)
+        loose = torch.ones_like(offsets)
+        loose[:, 2 * terms :] = 3 + 4 * reach.view(batch, len(sums), dim).sum(-1)
+        normals = torch.cat(
+            [(p.normals / p.rates.unsqueeze(-1)).expand(batch, -1, -1) for p in rows], 1
         )
-        # Infinite offsets and sums without weights let every action pass.
-        finite, cones_count = program.row_offsets.isfinite(), program.cone_rates > 0
-        return program._where(finite, cones_count, program.sum_rates > 0)
+        far = torch.cat([(p.offsets / p.rates).expand(batch, -1) for p in rows], 1)
+        far = (far - (normals @ middle.unsqueeze(-1)).squeeze(-1)) / unit
+        normals = normals * (half / unit).unsqueeze(-2)
+        height = max((part.matrix.shape[-2] for part in cones), default=0)
+        stacked_cones = middle.new_zeros(batch, len(cones), 1 + height, width)
+        tips = torch.zeros_like(stacked_cones[..., :1])
+        for i, cone in enumerate(cones):
+            rate = cone.rate * unit.squeeze(-1)
+            matrix = cone.matrix / rate[..., None, None]
+            vector = cone.vector / rate.unsqueeze(-1) + (matrix @ middle.unsqueeze(-1)).squeeze(-1)
+            stacked_cones[:, i, 1 : 1 + matrix.shape[-2], :dim] = -matrix * half.unsqueeze(-2)
+            tips[:, i, 1 : 1 + matrix.shape[-2], 0] = vector
+            tips[:, i, 0, 0] = cone.size / rate
+        return cls(
+            rows=torch.cat([stacked, pad(normals, (0, 1 + terms))], 1),
+            offsets=torch.cat([offsets, far], 1).unsqueeze(-1),
+            loose=torch.cat([loose, torch.ones_like(far)], 1).unsqueeze(-1),
+            cones=stacked_cones,
+            tips=tips,
+            middle=middle,
+            half=half,
+            unit=unit,
+            term_reach=reach,
+        )
 
     def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
-            required: slacks ``(B, M)`` required of all inequalities, in their order.
-            trial: flags of those that exceed it by t, 1 or 0; the others need no more than it.
-            counts: flags of those that count at all, 1 or 0.
+            required: slacks ``(B, R)`` required of all sums, rows and cones, in this order.
+            trial: flags of those that exceed it by t, boolean; the others need no more than it.
+            counts: flags of those that count at all, boolean.
         """
-        sizes = [self.row_rates.shape[-1], self.cone_rates.shape[-1], self.sum_rates.shape[-1]]
-        needs, trials, on = (rows.split(sizes, -1) for rows in (required, trial, counts))
-        shifted = replace(
+        first, dim = self.terms, self.dim
+        sizes = [self.rows.shape[1] - first, self.cones.shape[1]]
+        needs, tried, on = (
+            flags.unsqueeze(-1).split(sizes, 1) for flags in (required / self.unit, trial, counts)
+        )
+        offsets, loose = self.offsets[:, first:], self.loose[:, first:]
+        row_on, cone_on = on[0] & offsets.isfinite(), on[1].unsqueeze(-1)
+        kept = row_on.clone()
+        # Sums keep the terms, which nothing else bounds.
+        kept[:, : first // (2 * dim)] = True
+        rows = torch.cat([self.rows[:, :first], self.rows[:, first:] * kept], 1)
+        rows[:, first:, dim] = (tried[0] & row_on).squeeze(-1).to(rows)
+        cones = self.cones * cone_on
+        cones[:, :, 0, dim] = (tried[1] & on[1]).squeeze(-1).to(cones)
+        tips = self.tips.masked_fill(~cone_on, 0)
+        tips[:, :, 0] = torch.where(on[1], self.tips[:, :, 0] - needs[1], 1)
+        offsets = torch.where(row_on, offsets - needs[0], loose)
+        return replace(
             self,
-            row_offsets=self.row_offsets - self.row_rates * needs[0],
-            row_rates=self.row_rates * trials[0],
-            cone_sizes=self.cone_sizes - self.cone_rates * needs[1],
-            cone_rates=self.cone_rates * trials[1],
-            sum_sizes=self.sum_sizes - self.sum_rates * needs[2],
-            sum_rates=self.sum_rates * trials[2],
-        )
-        return shifted._where(*(flags > 0 for flags in on))
-
-    def _where(self, rows: Tensor, cones: Tensor, sums: Tensor) -> Self:
-        """Return the problems of the inequalities that count."""
-
-        def kept(value: Tensor, mask: Tensor, otherwise: float = 0.0) -> Tensor:
-            return torch.where(mask[(...,) + (None,) * (value.ndim - mask.ndim)], value, otherwise)
-
-        return type(self)(
-            rows=kept(self.rows, rows),
-            row_offsets=kept(self.row_offsets, rows, 1.0),
-            row_rates=kept(self.row_rates, rows),
-            matrices=kept(self.matrices, cones),
-            vectors=kept(self.vectors, cones),
-            cone_sizes=kept(self.cone_sizes, cones, 1.0),
-            cone_rates=kept(self.cone_rates, cones),
-            upper=kept(self.upper, sums),
-            lower=kept(self.lower, sums),
-            sum_sizes=kept(self.sum_sizes, sums, 1.0),
-            sum_rates=kept(self.sum_rates, sums),
+            rows=rows,
+            offsets=torch.cat([self.offsets[:, :first], offsets], 1),
+            cones=cones,
+            tips=tips,
         )
 
     @property
-    def has_cones(self) -> bool:
-        """Whether there are any second-order cones."""
-        return self.matrices.shape[1] > 0
+    def dim(self) -> int:
+        """The dimension d of the actions."""
+        return self.middle.shape[-1]
 
     @property
-    def has_sums(self) -> bool:
-        """Whether there are any kinked sums."""
-        return self.upper.shape[1] > 0
+    def terms(self) -> int:
+        """The number of rows that bound the terms of sums."""
+        return 2 * self.term_reach.shape[-1]
 
     def select(self, keep: Tensor) -> Self:
         """Return some of the B problems."""
         return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
-    def with_rows(self, normals: Tensor, offsets: Tensor, rates: Tensor, counts: Tensor) -> Self:
-        """Return the problems with rows ``(B, m, d)`` added, where they count."""
+    def with_rows(self, normals: Tensor, offsets: Tensor, trial: Tensor, counts: Tensor) -> Self:
+        """Return the problems with rows added, where they count.
+
+        Args:
+            normals: normals of the rows, ``(B, m, d)``, of slacks that are no further divided.
+            offsets: offsets of the rows, ``(B, m)``.
+            trial: flags of the rows on trial, boolean ``(B, m)``.
+            counts: flags of the rows that count, boolean ``(B, m)``.
+        """
+        offsets = (offsets - (normals @ self.middle.unsqueeze(-1)).squeeze(-1)) / self.unit
+        rows = pad(normals * (self.half / self.unit).unsqueeze(-2), (0, 1 + self.terms // 2))
+        rows[..., self.dim] = trial.to(rows)
+        rows = rows * counts.unsqueeze(-1)
+        offsets = torch.where(counts, offsets, 1.0).unsqueeze(-1)
         return replace(
             self,
-            rows=torch.cat([self.rows, normals * counts.unsqueeze(-1)], 1),
-            row_offsets=torch.cat([self.row_offsets, torch.where(counts, offsets, 1.0)], 1),
-            row_rates=torch.cat([self.row_rates, rates * counts], 1),
+            rows=torch.cat([self.rows, rows], 1),
+            offsets=torch.cat([self.offsets, offsets], 1),
+            loose=torch.cat([self.loose, torch.ones_like(offsets)], 1),
         )
 
-    def barrier_parameter(self) -> int:
-        """Return nu: one for each row, two for each cone, two and one a kinked sum's terms."""
-        terms = 2 * self.upper.shape[-1] + 1
-        return self.rows.shape[1] + 2 * self.matrices.shape[1] + terms * self.upper.shape[1]
+    def at(self, action: Tensor) -> Tensor:
+        """Return x ``(B, n, 1)`` at an action, with a slack of 0 and exact terms of all sums."""
+        dim, first = self.dim, self.terms
+        place = ((action - self.middle) / self.half).unsqueeze(-1)
+        x = pad(place, (0, 0, 0, self.rows.shape[-1] - dim))
+        if first:
+            rooms = self.offsets[:, :first] - self.rows[:, :first] @ x
+            x[:, dim + 1 :] = torch.maximum(*(-rooms).chunk(2, 1))
+        return x
+
+    def action(self, x: Tensor) -> Tensor:
+        """Return the actions ``(B, d)`` of unknowns."""
+        return torch.addcmul(self.middle, self.half, x[:, : self.dim, 0])
+
+    def start(self, action: Tensor) -> Tensor:
+        """Return x strictly inside at an action, its slack a mean half width below the possible."""
+        x = self.at(action)
+        x[:, self.dim] = (self.slack_of(x) - 1).unsqueeze(-1)
+        if self.terms:
+            first, count = self.terms, self.terms // (2 * self.dim)
+            sums = slice(first, first + count)
+            room = self.offsets[:, sums] - self.rows[:, sums] @ x
+            x[:, self.dim + 1 :] += (room / (2 * self.dim)).repeat_interleave(self.dim, 1)
+        return x
 
     def slack(self, action: Tensor) -> Tensor:
-        """Return the smallest slack at an action, ``(B,)``."""
-        return self._smallest(self._rooms(action))
+        """Return the smallest slack at an action of what is on trial, ``(B,)``."""
+        return self.slack_of(self.at(action)) * self.unit.squeeze(-1)
 
-    def bound_within(self, action: Tensor, distance: Tensor) -> Tensor:
-        """Return an upper bound of the smallest slack within a distance of an action, ``(B,)``."""
-        kinks = torch.maximum(self.upper.abs(), self.lower.abs())
-        steepness = torch.cat(
-            [
-                vector_norm(self.rows, dim=-1),
-                spectral_norm_bound(self.matrices),
-                vector_norm(kinks, dim=-1),
-            ],
-            -1,
-        )
-        return self._smallest(self._rooms(action) + steepness * distance.unsqueeze(-1))
+    def slack_of(self, x: Tensor) -> Tensor:
+        """Return the largest t at the actions and terms of x, ``(B,)``, in units."""
+        rooms = self.offsets - self.rows @ x
+        least = _of_trial(rooms, self.rows[:, :, self.dim]).amin((1, 2))
+        if self.cones.shape[1]:
+            heights = self.tips - self.cones @ x.unsqueeze(1)
+            rooms = heights[:, :, 0] - vector_norm(heights[:, :, 1:], dim=2)
+            least = torch.minimum(
+                least, _of_trial(rooms, self.cones[:, :, 0, self.dim]).amin((1, 2))
+            )
+        return least + x[:, self.dim, 0]
 
-    def _rooms(self, action: Tensor) -> Tensor:
-        """Return by how much each inequality holds at a slack of zero."""
-        rows = self.row_offsets - (self.rows @ action.unsqueeze(-1)).squeeze(-1)
-        cones = self.cone_sizes - vector_norm(self.white(action), dim=-1)
-        sums = self.sum_sizes - self._terms(action).sum(-1)
-        return torch.cat([rows, cones, sums], -1)
-
-    def _smallest(self, rooms: Tensor) -> Tensor:
-        """Return the smallest slack of those that rooms leave."""
-        rates = torch.cat([self.row_rates, self.cone_rates, self.sum_rates], -1)
-        return torch.where(rates > 0, rooms / rates, torch.inf).amin(-1)
-
-    def start(self, action: Tensor, margin: Tensor) -> Point:
-        """Return a strictly feasible point at an action, its slack a margin below the possible."""
-        slack = self.slack(action) - margin
-        terms = self._terms(action)
-        room = self.sum_sizes - self.sum_rates * slack.unsqueeze(-1) - terms.sum(-1)
-        return Point(action, slack, terms + (room / (2 * action.shape[-1])).unsqueeze(-1))
-
-    def gained(self, s: Distances) -> Tensor:
-        """Return by how much t could be larger at the action of a point, ``(B,)``."""
-        parts = [s.rows / self.row_rates]
-        if self.has_cones:
-            parts.append(s.cone_gaps / self.cone_rates)
-        if self.has_sums:
-            parts.append(s.sums / self.sum_rates)
-        return (torch.cat(parts, -1) if len(parts) > 1 else parts[0]).amin(-1)
-
-    def barrier(self, s: Distances) -> Tensor:
-        """Return the barrier's value ``(*trials, B)``, infinite where a point is not feasible."""
-        value = s.rows.log().sum(-1)
-        if self.has_cones:
-            value = value + (s.cone_gaps.log() + s.cone_sums.log()).sum(-1)
-        if self.has_sums:
-            value = value + s.sums.log().sum(-1)
-            value = value + (s.upper.log() + s.lower.log()).sum((-2, -1))
-        return -value.nan_to_num(nan=-torch.inf, posinf=torch.inf)
-
-    def distances(self, at: Point) -> Distances:
-        """Return by how much each inequality holds; none may be negative."""
-        slack = at.slack.unsqueeze(-1)
-        rows = self.row_offsets - self.row_rates * slack
-        rows = rows - (self.rows @ at.action.unsqueeze(-1)).squeeze(-1)
-        gaps = sums = upper = lower = totals = rows[..., :0]
-        if self.has_cones:
-            height = self.cone_sizes - self.cone_rates * slack
-            length = vector_norm(self.white(at.action), dim=-1)
-            gaps, sums = height - length, height + length
-        if self.has_sums:
-            action = at.action.unsqueeze(-2)
-            upper, lower = at.terms - self.upper * action, at.terms - self.lower * action
-            totals = self.sum_sizes - self.sum_rates * slack - at.terms.sum(-1)
-        return Distances(rows, gaps, sums, upper, lower, totals)
-
-    def white(self, action: Tensor) -> Tensor:
-        """Return ``W a + y`` of each cone, ``(*trials, B, J, k)``."""
-        return (self.matrices @ action[..., None, :, None]).squeeze(-1) + self.vectors
-
-    def _terms(self, action: Tensor) -> Tensor:
-        action = action.unsqueeze(-2)
-        return torch.maximum(self.upper * action, self.lower * action)
+    def bound(self) -> Tensor:
+        """Return upper bounds of what each of the slacks can be within the bounds, ``(B,)``."""
+        dim = self.dim
+        rooms = self.offsets + self.rows[..., :dim].abs().sum(-1, keepdim=True)
+        least = _of_trial(rooms, self.rows[:, :, dim]).amin((1, 2))
+        if self.cones.shape[1]:
+            reach = vector_norm(self.cones[:, :, 1:, :dim], dim=2).sum(-1, keepdim=True)
+            near = (vector_norm(self.tips[:, :, 1:], dim=2) - reach).relu()
+            rooms = _of_trial(self.tips[:, :, 0] - near, self.cones[:, :, 0, dim])
+            least = torch.minimum(least, rooms.amin((1, 2)))
+        return least
 
 
-def _rows_padded(tensor: Tensor, height: int, axis: int) -> Tensor:
-    missing = height - tensor.shape[axis]
-    return pad(tensor, (0, missing) if axis == -1 else (0, 0, 0, missing))
+def _of_trial(rooms: Tensor, rates: Tensor) -> Tensor:
+    """Return rooms ``(B, M, 1)``, infinite where the rate of t is 0."""
+    return rooms.masked_fill((rates == 0).unsqueeze(-1), torch.inf)

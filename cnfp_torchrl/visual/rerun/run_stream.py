@@ -166,6 +166,10 @@ class TrainingStream:
         self._make_episodes = episodes
         self._episodes: EpisodeStream | None = None
 
+    def continue_at(self, frames: int) -> None:
+        """Go on along the timeline after as many steps of all agents."""
+        self.on_batch.frames = frames
+
     def on_episode(self, episode: Sequence[TensorDictBase]) -> None:
         """Stream the transitions of an episode, behind all that was seen before."""
         if self._episodes is None:

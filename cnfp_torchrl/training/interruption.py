@@ -1,0 +1,68 @@
+"""Signals that ask a run to stop, which end it when its state is saved."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+"""The signals that ask a run to stop; the second is Ctrl-C's."""
+
+
+class TrainingInterrupted(BaseException):
+    """A run was asked to stop, and has saved its state.
+
+    No `Exception`, which Hydra would take for a failure and go on with the next run of a sweep.
+
+    Args:
+        number: number of the signal.
+        message: sentence that says how to go on.
+    """
+
+    def __init__(self, number: int, message: str) -> None:
+        super().__init__(message)
+        self.number = number
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TrainingInterrupted, (self.number, str(self))
+
+
+class StopRequest:
+    """Remembers SIGTERM and Ctrl-C while it is entered; a second one ends the program at once.
+
+    Outside of the main thread, where Python takes no signals, nothing is changed.
+
+    Args:
+        signals: numbers of the signals; none changes nothing.
+    """
+
+    def __init__(self, signals: Sequence[int] = STOP_SIGNALS) -> None:
+        self._signals = signals
+        self.signal: int | None = None
+        """The number of the signal that came, or None."""
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {n: signal.signal(n, self._remember) for n in self._signals}
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+        name = signal.Signals(number).name
+        sys.stderr.write(f"\n{name}: the run stops after this step and saves; again: at once\n")

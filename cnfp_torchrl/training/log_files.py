@@ -1,0 +1,44 @@
+"""The log of a run that goes on: what was written after the state that it goes on from is cut."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from cnfp_torchrl.whole_file import whole_file
+
+
+def cut_logs(folder: Path, step: int) -> None:
+    """Remove what TorchRL's CSV and TensorBoard loggers wrote after a step, and broken last lines.
+
+    What is removed will be written anew, so that no row is missing and none is there twice.
+
+    Args:
+        folder: a run's folder, in whose subfolders the loggers write.
+        step: the last one whose entries stay.
+    """
+    for path in sorted(folder.glob("*/scalars/**/*.csv")):
+        lines = path.read_bytes().splitlines(keepends=True)
+        kept = [line for line in lines if line.endswith(b"\n") and int(line.split(b",")[0]) <= step]
+        if kept != lines:
+            with whole_file(path) as file:
+                file.writelines(kept)
+    for path in sorted(folder.rglob("events.out.tfevents.*")):
+        _cut_events(path, step)
+
+
+def _cut_events(path: Path, step: int) -> None:
+    """Write a file of TensorBoard's anew, without events after a step.
+
+    TensorBoard would hide them by itself if told where a run goes on, other readers would not.
+    """
+    if importlib.util.find_spec("tensorboard") is None:
+        return
+    from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    with whole_file(path) as file:
+        writer = RecordWriter(file)
+        for event in LegacyEventFileLoader(str(path)).Load():
+            if event.step <= step:
+                writer.write(event.SerializeToString())

@@ -1,0 +1,83 @@
+"""Our parts in TorchRL's groups of configurations, and its own trainer that trains with them."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torchrl.trainers.algorithms.configs  # noqa: F401 - registers TorchRL's groups
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.utils import get_object, instantiate
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+import cnfp_torchrl.configuration.torchrl_groups as groups
+from cnfp_torchrl.envs import ActionGuard, ConstrainedActions, appended_transforms
+from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.objectives import ConstrainedSACLoss
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
+OURS = {
+    "env": ["constrained"],
+    "transform": ["action_guard", "constrained_actions", "constraint_cost", "reward_penalty"],
+    "model": ["constrained_actor"],
+    "loss": ["constrained_sac"],
+    "logger": ["rerun"],
+}
+
+
+def trainer_config(*overrides: str) -> Any:
+    with initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        return compose("torchrl_trainer", overrides=list(overrides))
+
+
+@pytest.mark.parametrize(("group", "name"), [(g, n) for g, names in OURS.items() for n in names])
+def test_registered_beside_torchrls(group: str, name: str) -> None:
+    known = ConfigStore.instance().list(group)
+    assert f"{name}.yaml" in known
+    assert len(known) > 1
+    node = ConfigStore.instance().load(f"{group}/{name}.yaml").node
+    assert callable(get_object(node["_target_"]))
+
+
+def test_the_table_of_the_module_lists_them() -> None:
+    for group, names in OURS.items():
+        for name in names:
+            assert f"| ``{group}`` | ``{name}`` |" in (groups.__doc__ or "")
+
+
+def test_transforms_are_made_and_fields_are_arguments() -> None:
+    for node, made in (
+        (groups.ActionGuardConfig(), ActionGuard),
+        (groups.ConstrainedActionsConfig(unbounded=True), ConstrainedActions),
+    ):
+        assert isinstance(instantiate(OmegaConf.structured(node)), made)
+        assert {each.name for each in fields(node)} - {"_target_"}
+
+
+# Of TorchRL's trainers themselves.
+@pytest.mark.filterwarnings("ignore:SACTrainer is an experimental")
+@pytest.mark.filterwarnings("ignore:The '.*' hook stage will be replaced:FutureWarning")
+def test_torchrls_trainer_trains_within_the_constraints() -> None:
+    torch.manual_seed(0)
+    config = trainer_config("steps=256", "agents=8", "trainer.optim_steps_per_batch=4")
+    trainer = instantiate(config.trainer)
+    assert isinstance(trainer.loss_module, ConstrainedSACLoss)
+    env = trainer.collector.env
+    assert any(isinstance(each, ActionGuard) for each in appended_transforms(env))
+    acting = trainer.collector.policy
+    assert flow_head(acting).order == ["battery", "obstacle"]
+    first = TensorDict.from_module(acting).data.clone()
+    costs = []
+    trainer.register_op("pre_steps_log", lambda td: costs.append(td["next", "cost"]))
+    trainer.train()
+    assert trainer.collected_frames == 256
+    assert torch.cat([cost.flatten(0, -2) for cost in costs]).sum() == 0
+    learned = TensorDict.from_module(trainer.loss_module.actor_network).data
+    now = TensorDict.from_module(acting).data
+    # The collector's actor is another object, and has the loss's weights.
+    for key, value in now.items(True, True):
+        assert not torch.equal(value, first[key])
+        torch.testing.assert_close(value, learned[key])

@@ -1,0 +1,53 @@
+"""Reads of tensors on the host, for which a program on a GPU waits; counted on any machine."""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+_WAITS = (
+    "aten::_local_scalar_dense",
+    "aten::equal",
+    "aten::is_nonzero",
+    "aten::lift_fresh",
+    "aten::masked_select",
+    "aten::nonzero",
+)
+"""Operations whose result the host waits for, or that copy numbers of Python's to the device."""
+
+
+class HostReads(TorchDispatchMode):
+    """Counts, by the line of this project's code, operations that would wait for a GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: Counter[str] = Counter()
+
+    @property
+    def count(self) -> int:
+        """The number of reads."""
+        return self.lines.total()
+
+    def __torch_dispatch__(
+        self,
+        func: Any,
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        name = func._schema.name
+        masked = name.startswith("aten::index") and any(
+            isinstance(each, Tensor) and each.dtype == torch.bool
+            for each in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
+        )
+        if name in _WAITS or masked:
+            frames = [f for f in traceback.extract_stack() if "cnfp_torchrl" in f.filename]
+            at = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "elsewhere"
+            self.lines[f"{at} {name}"] += 1
+        return func(*args, **(kwargs or {}))

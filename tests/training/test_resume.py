@@ -1,0 +1,359 @@
+"""A run that was stopped ends as one that was not."""
+
+import json
+import os
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from rerun.chunk import RrdReader
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, TransformedEnv
+
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.training.checkpoints import CheckpointError, Checkpoints
+from cnfp_torchrl.training.environment_state import EpisodesBeginAnewWarning
+from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.metrics import Metrics
+from cnfp_torchrl.training.resume import resumed_config
+from cnfp_torchrl.training.run_folder import STATES, RunFolder
+from cnfp_torchrl.training.run_state import BrokenCheckpointWarning
+from cnfp_torchrl.training.train import train
+
+from .conftest import TINY as SHORT
+
+MakeConfig = Callable[..., DictConfig]
+
+OF_THE_CLOCK = ("train/seconds", "train/processor_seconds", "train/steps_per_second")
+TINY = [*SHORT, "evaluation.episodes=1", "training.update_ratio=0.1", "checkpoint.interval=64"]
+
+
+class Killed(BaseException):
+    """What ends a run at once, as far as that can be done within a process."""
+
+
+def run_until(config: DictConfig, path: Path, frames: int, *, resume: bool = False) -> None:
+    """Train until a number of steps is counted, and no further; no state is saved for it."""
+    count = Metrics.add_steps
+
+    def counting(self: Metrics, batch: Any) -> None:
+        count(self, batch)
+        if self.frames >= frames:
+            raise Killed
+
+    folder = RunFolder.resume(path) if resume else RunFolder.create(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Metrics, "add_steps", counting)
+        with pytest.raises(Killed):
+            train(config, folder, resume=resume)
+
+
+def go_on(path: Path, *overrides: str, make_config: MakeConfig) -> dict[str, Any]:
+    folder = RunFolder.resume(path)
+    config = resumed_config(folder, make_config(*overrides), overrides, [__name__])
+    return train(config, folder, resume=True)
+
+
+def same(first: Any, second: Any) -> bool:
+    """Tell whether two states are equal bit by bit."""
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(same, first, second))
+    return bool(first == second) or (first != first and second != second)
+
+
+def scalars(path: Path) -> dict[str, str]:
+    """Return the rows of the CSV files but for those of the clock."""
+    root = path / "metrics" / "scalars"
+    files = {str(file.relative_to(root))[:-4]: file for file in root.rglob("*.csv")}
+    return {name: file.read_text() for name, file in files.items() if name not in OF_THE_CLOCK}
+
+
+def events(path: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return the points in TensorBoard's files, in the order in which they were written."""
+    points: dict[str, list[tuple[int, float]]] = {}
+    for file in sorted((path / "tensorboard").iterdir()):
+        reader = EventAccumulator(str(file), purge_orphaned_data=False).Reload()
+        for name in reader.Tags()["scalars"]:
+            if name not in OF_THE_CLOCK:
+                points.setdefault(name, []).extend((e.step, e.value) for e in reader.Scalars(name))
+    return points
+
+
+def assert_same_run(first: Path, second: Path) -> None:
+    states = [RunFolder(path).load_checkpoint() for path in (first, second)]
+    assert same(*states)
+    assert scalars(first) == scalars(second)
+    assert scalars(first)
+    assert events(first) == events(second)
+    results = [summary(path) for path in (first, second)]
+    assert results[0] == results[1]
+
+
+def summary(path: Path) -> dict[str, Any]:
+    content = json.loads((path / "summary.json").read_text())
+    return {name: value for name, value in content.items() if name != "seconds"}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that was not stopped."""
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", overrides=TINY)
+    train(config, RunFolder.create(path))
+    return path
+
+
+# Before the first state; between two; in the last step.
+@pytest.mark.parametrize("killed_at", [48, 160, 192])
+def test_a_killed_run_ends_as_one_that_was_not(
+    killed_at: int, whole: Path, make_config: MakeConfig, tmp_path: Path
+) -> None:
+    run_until(make_config(*TINY), tmp_path / "killed", killed_at)
+    go_on(tmp_path / "killed", make_config=make_config)
+    assert_same_run(whole, tmp_path / "killed")
+
+
+OTHERS = {
+    "a learned price": ["loss=sac_lagrangian", "flow=unconstrained", "~env.score"],
+    "a full buffer": ["replay_buffer.storage.max_size=72", "checkpoint.keep=1"],
+    "computed sets": ["training.constraint_bytes=0", "flow=projection"],
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_runs_of_all_kinds_go_on(kind: str, make_config: MakeConfig, tmp_path: Path) -> None:
+    config = make_config(*TINY, *OTHERS[kind])
+    train(config, RunFolder.create(tmp_path / "whole"))
+    run_until(config, tmp_path / "killed", 160)
+    go_on(tmp_path / "killed", make_config=make_config)
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def gymnasium_env(name: str) -> EnvBase:
+    env = GymEnv(name, max_episode_steps=20)
+    if env.observation_spec["observation"].dtype == torch.float32:
+        return env
+    return TransformedEnv(env, DoubleToFloat(in_keys=["observation"], out_keys=["observation"]))
+
+
+def of_gymnasium(name: str, make_config: MakeConfig) -> DictConfig:
+    config = make_config(*TINY, "flow=unconstrained")
+    base = {"_target_": f"{__name__}.gymnasium_env", "name": name}
+    config.env = {"agents": 16, "base": base, "geometry": {}}
+    return config
+
+
+def test_episodes_of_mujoco_go_on(make_config: MakeConfig, tmp_path: Path) -> None:
+    config = of_gymnasium("Hopper-v5", make_config)
+    train(config, RunFolder.create(tmp_path / "whole"))
+    run_until(config, tmp_path / "killed", 160)
+    go_on(tmp_path / "killed", make_config=make_config)
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_where_an_environment_gives_no_state_its_episodes_begin_anew(
+    make_config: MakeConfig, tmp_path: Path
+) -> None:
+    config = of_gymnasium("Pendulum-v1", make_config)
+    run_until(config, tmp_path / "killed", 160)
+    with pytest.warns(EpisodesBeginAnewWarning, match=r"step 128 begin anew: .*GymEnv"):
+        assert go_on(tmp_path / "killed", make_config=make_config)["steps"] == 192
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_stops_a_run_when_it_is_saved(
+    number: int,
+    whole: Path,
+    make_config: MakeConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = RunFolder.create(tmp_path / "stopped")
+    count = Metrics.add_steps
+
+    def counting(self: Metrics, batch: Any) -> None:
+        count(self, batch)
+        if self.frames == 112:
+            os.kill(os.getpid(), number)
+
+    handlers = [signal.getsignal(each) for each in STOP_SIGNALS]
+    with monkeypatch.context() as patch:
+        patch.setattr(Metrics, "add_steps", counting)
+        with pytest.raises(TrainingInterrupted, match="step 112") as stopped:
+            train(make_config(*TINY), folder)
+    assert f"resume={tmp_path / 'stopped'}" in str(stopped.value)
+    assert handlers == [signal.getsignal(each) for each in STOP_SIGNALS]
+    go_on(folder.path, make_config=make_config)
+    assert_same_run(whole, folder.path)
+
+
+def test_a_second_signal_stops_at_once() -> None:
+    with StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_finished_run_can_be_extended(make_config: MakeConfig, tmp_path: Path) -> None:
+    # So that the last entry of the log is not one of the longer run's.
+    settings = [*TINY, "training.log_interval=80"]
+    longer = "collector.total_frames=288"
+    train(make_config(*settings, longer), RunFolder.create(tmp_path / "whole"))
+    train(make_config(*settings), RunFolder.create(tmp_path / "extended"))
+    before = (tmp_path / "extended" / "summary.json").read_text()
+    with pytest.raises(ValueError, match="finished with 192 steps"):
+        go_on(tmp_path / "extended", make_config=make_config)
+    with pytest.raises(ValueError, match="at least the 192 steps"):
+        go_on(tmp_path / "extended", "collector.total_frames=96", make_config=make_config)
+    assert (tmp_path / "extended" / "summary.json").read_text() == before
+    go_on(tmp_path / "extended", longer, make_config=make_config)
+    assert_same_run(tmp_path / "whole", tmp_path / "extended")
+    assert RunFolder(tmp_path / "extended").load_settings()["collector"]["total_frames"] == 288
+
+
+@pytest.fixture
+def stopped(make_config: MakeConfig, tmp_path: Path) -> Path:
+    """The folder of a run that was killed at step 160, with states at 64 and 128."""
+    run_until(make_config(*TINY), tmp_path / "stopped", 160)
+    return tmp_path / "stopped"
+
+
+REFUSED = ["seed=3", "flow=squash", "env.agents=8", "optim.lr=0.1", "experiment=squash"]
+
+
+@pytest.mark.parametrize("override", REFUSED)
+def test_what_would_change_a_run_is_refused(
+    override: str, make_config: MakeConfig, tmp_path: Path
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.save_config(make_config(*TINY))
+    with pytest.raises(ValueError, match=override.partition("=")[0]):
+        resumed_config(folder, make_config(override), [override])
+
+
+def test_what_is_as_it_was_may_be_given_again(make_config: MakeConfig, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.save_config(make_config(*TINY, "seed=3", "flow=squash"))
+    given = ["seed=3", "flow=squash", "visual=file", "checkpoint.interval=7", "resume=x"]
+    config = resumed_config(folder, make_config(*given), given)
+    assert (config.seed, config.checkpoint.interval, config.visual.every) == (3, 7, 10)
+    assert config.collector.total_frames == 192
+
+
+def test_a_strangers_run_is_not_trained_further(make_config: MakeConfig, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    config = make_config(*TINY)
+    config.optim._target_ = "os.system"
+    folder.save_config(config)
+    with pytest.raises(PermissionError, match=r"optim\._target_"):
+        resumed_config(folder, make_config(), [])
+
+
+class Payload:
+    """What a stranger's state could carry: code that runs when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("kind", ["state", "transitions"])
+def test_a_strangers_state_runs_no_code(
+    kind: str, stopped: Path, make_config: MakeConfig, tmp_path: Path
+) -> None:
+    for file in (stopped / STATES).glob(f"{kind}-*"):
+        torch.save({"metrics": Payload(tmp_path / "owned")}, file)
+    with pytest.raises(CheckpointError, match=kind):
+        go_on(stopped, make_config=make_config)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_an_older_state_serves_where_the_newest_is_broken(
+    whole: Path, stopped: Path, make_config: MakeConfig
+) -> None:
+    newest = max((stopped / STATES).glob("state-*"))
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.warns(BrokenCheckpointWarning, match=r"state-0*128\.pt.*goes on at step 64"):
+        go_on(stopped, make_config=make_config)
+    assert_same_run(whole, stopped)
+
+
+def test_on_a_full_disk_the_states_before_stay(
+    whole: Path, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder.create(tmp_path / "full")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    save = Checkpoints.save
+
+    def save_on_a_full_disk(self: Checkpoints, frames: int, components: Any) -> None:
+        if frames == 128:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+        try:
+            save(self, frames, components)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", save_on_a_full_disk)
+        with pytest.raises(CheckpointError, match=r"state-0*128.*room"):
+            train(make_config(*TINY), folder)
+    states = (folder.path / STATES).glob("*state-*")
+    assert [path.name for path in states] == ["state-000000000064.pt"]
+    go_on(folder.path, make_config=make_config)
+    assert_same_run(whole, folder.path)
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(
+    make_config: MakeConfig, tmp_path: Path
+) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    (folder.path / STATES).write_text("not a folder")
+    with pytest.raises(CheckpointError, match=rf"{STATES}.*could not be written"):
+        train(make_config(*TINY), folder)
+
+
+def test_states_are_few_and_can_be_done_without(make_config: MakeConfig, tmp_path: Path) -> None:
+    short = make_config(*TINY[:-1], "checkpoint.interval=32", "replay_buffer.storage.max_size=48")
+    folder = RunFolder.create(tmp_path / "kept")
+    train(short, folder)
+    names = sorted(path.name for path in (folder.path / STATES).iterdir())
+    # The older state, at step 160, needs the last 48 transitions before it.
+    kept = {"state": [160, 192], "transitions": [128, 160, 192]}
+    assert names == [f"{kind}-{step:012d}.pt" for kind, steps in kept.items() for step in steps]
+    for setting in ("checkpoint.interval=null", "checkpoint.keep_last=false"):
+        folder = RunFolder.create(tmp_path / setting)
+        train(make_config(*TINY, setting), folder)
+        assert not (folder.path / STATES).exists()
+
+
+def test_a_recording_goes_on_in_a_file_of_its_own(make_config: MakeConfig, tmp_path: Path) -> None:
+    config = make_config(*TINY, "visual=file", "visual.samples=8")
+    run_until(config, tmp_path / "run", 160)
+    go_on(tmp_path / "run", make_config=make_config)
+    first, second = (
+        {
+            step
+            for chunk in RrdReader(str(tmp_path / "run" / name)).stream().filter(content="/**")
+            if "env_step" in (columns := chunk.to_record_batch()).schema.names
+            for step in columns.column("env_step").to_pylist()
+        }
+        for name in ("recording.rrd", "recording-2.rrd")
+    )
+    assert min(first) == 0
+    assert max(first) <= 160
+    assert min(second) == 128
+    assert max(second) > 192  # an episode of the evaluation behind the training
