@@ -10,7 +10,6 @@ from torch import Tensor
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, stacked
 from cnfp_torchrl.bijectors.region_squash import ExactSquash, split
 from cnfp_torchrl.geometry import (
-    ACTION_RANGE,
     Box,
     ConstraintSet,
     Gauge,
@@ -52,7 +51,7 @@ class SoftRetraction(Bijector):
 
     Args:
         region: regions of batch shape ``(*batch,)``; they are eroded here. Their bounds may be
-            infinite: see `resolvable`.
+            infinite (`Region.with_finite_bounds`).
         outer: convex sets that arguments lie in, not eroded here and bounded or not, with the
             anchor strictly inside; None is R^d.
         sharpness: sharpness p, from 1 to `MOST_SHARP`.
@@ -74,7 +73,7 @@ class SoftRetraction(Bijector):
         validate_args: bool = True,
     ) -> None:
         super().__init__()
-        region = resolvable(region)
+        region = region.with_finite_bounds()
         if validate_args:
             require_action_bounds(region.bounds)
         self.region = region.eroded()
@@ -287,25 +286,6 @@ def _inverse_soft_factor(
         # Rays that would leave the outer set have no argument.
         factor = torch.where(progress * factor < 1, factor, torch.nan)
     return factor, log_u
-
-
-def resolvable(region: Region) -> Region:
-    r"""Return a region with its bounds no further from the anchor than its dtype resolves.
-
-    Infinite bounds become finite ones, at :math:`2^{-13}/\epsilon` times the anchor's slack: 1,024
-    times in float32 and 5e11 times in float64. Erosion by the rounding error of actions as large as
-    that takes at most a few hundredths of the anchor's slack.
-
-    Args:
-        region: regions with an anchor.
-    """
-    bounds, anchor = region.bounds, region.anchor
-    reach = region.slack(anchor) / (2**13 * torch.finfo(anchor.dtype).eps)
-    reach = reach.clamp(max=ACTION_RANGE[anchor.dtype][1] / 2).unsqueeze(-1)
-    low = torch.where(bounds.low.isinf(), anchor - reach, bounds.low)
-    high = torch.where(bounds.high.isinf(), anchor + reach, bounds.high)
-    sets = (Box(low, high, validate_args=False), *region.sets[1:])
-    return Region(sets, anchor, region.active, region.relaxation, validate_args=False)
 
 
 def require_sharpness(sharpness: float) -> float:

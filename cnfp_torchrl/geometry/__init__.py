@@ -12,7 +12,6 @@ from cnfp_torchrl.geometry.anchor import (
 )
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
 from cnfp_torchrl.geometry.box import (
-    ACTION_RANGE,
     Box,
     gauge_of_sides,
     require_action_bounds,
@@ -36,7 +35,6 @@ from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
 from cnfp_torchrl.geometry.weighted_sums import PositivePart, WeightedL1Ball
 
 __all__ = [
-    "ACTION_RANGE",
     "DEPTH",
     "EROSION_IN_EPS",
     "LEEWAY",

@@ -35,6 +35,7 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.layer import ConstraintLayer
 from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
@@ -49,6 +50,7 @@ __all__ = [
     "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintLayer",
     "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
