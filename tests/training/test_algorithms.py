@@ -10,7 +10,6 @@ from omegaconf import DictConfig
 
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
-
 from experiments.resume import differences
 
 from .conftest import TINY
