@@ -13,7 +13,12 @@ from cnfp_torchrl.geometry.anchor import (
     row_depths,
 )
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
-from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
+from cnfp_torchrl.geometry.box import (
+    Box,
+    gauge_of_sides,
+    require_action_bounds,
+    sides,
+)
 from cnfp_torchrl.geometry.constraint_set import (
     EROSION_IN_EPS,
     Bounds,

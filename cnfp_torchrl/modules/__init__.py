@@ -19,6 +19,7 @@ from cnfp_torchrl.modules.flows import (
     GaugeFlow,
     ProjectionFlow,
     RadialFlow,
+    SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
     resolve_safe_flow,
@@ -34,6 +35,7 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.layer import ConstraintLayer
 from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
@@ -42,12 +44,13 @@ from cnfp_torchrl.modules.publisher import (
     constraint_bijectors,
     publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
     "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintLayer",
     "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
@@ -62,7 +65,9 @@ __all__ = [
     "ProjectionFlow",
     "RadialFlow",
     "RelaxedConstraintError",
+    "SafeRandomLatents",
     "SafeRandomPolicy",
+    "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",
