@@ -19,6 +19,7 @@ from cnfp_torchrl.modules.flows import (
     GaugeFlow,
     ProjectionFlow,
     RadialFlow,
+    SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
     resolve_safe_flow,
@@ -34,6 +35,7 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.layer import ConstraintLayer
 from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
@@ -48,6 +50,7 @@ __all__ = [
     "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintLayer",
     "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
@@ -64,6 +67,7 @@ __all__ = [
     "RelaxedConstraintError",
     "SafeRandomLatents",
     "SafeRandomPolicy",
+    "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",

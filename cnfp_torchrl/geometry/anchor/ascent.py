@@ -253,7 +253,7 @@ def _least(values: Sequence[Tensor]) -> Tensor:
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve with positive definite matrices ``(d, d, B)``, by elimination where they are small."""
-    if len(right) > 4:
+    if len(right) > 4 and not torch.compiler.is_exporting():
         solution = torch.linalg.solve_ex(matrix.permute(2, 0, 1), right.mT.unsqueeze(-1))[0]
         return solution.squeeze(-1).mT
     rest = torch.cat([matrix, right.unsqueeze(1)], 1)

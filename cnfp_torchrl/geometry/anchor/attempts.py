@@ -15,7 +15,7 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 STEPS = 6
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
 
-REFINEMENTS = (4, 3, 5)
+REFINEMENTS = (4, 3)
 """The numbers of steps inwards after which it is looked which states need more of them."""
 
 SHARE = 0.3
