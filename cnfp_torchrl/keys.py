@@ -45,9 +45,10 @@ RESERVED_NAMES = (ANCHOR_KEY[-1], SAFE_ACTION_KEY[-1])
 CONSTRAINT_STATES = ("active", "relaxed", "dropped")
 """What a constraint is in a state: it holds as stated, by a wider set, or not at all."""
 
+OBSERVATION_KEY = "observation"
+ACTION_KEY = "action"
 LOC_KEY = "loc"
 SCALE_KEY = "scale"
-ACTION_KEY = "action"
 PREVIOUS_ACTION_KEY = "previous_action"
 LOG_DET_KEY = "log_det"
 LATENT_KEY = "latent"

@@ -35,7 +35,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.envs import constraint_bijectors, constraint_names
 from cnfp_torchrl.modules import flow_head, make_constrained_actor
-from cnfp_torchrl.training.agent import application_order, build_actor, build_environment
+from cnfp_torchrl.training.agent import build_actor, build_environment
 
 RESULT = Path(__file__).parent / "results" / "hostile_networks.json"
 SAFE_FLOWS = ("exact", "gauge", "radial", "projection")
@@ -201,7 +201,6 @@ def build(
         network,
         bijectors=constraint_bijectors(env),
         spec=env.action_spec_unbatched,
-        order=application_order(config),
         flow=instantiate(config.flow),
     )
     return actor, network.new_episode

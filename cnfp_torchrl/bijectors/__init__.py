@@ -7,10 +7,17 @@ from cnfp_torchrl.bijectors.radial_squash import RadialSquash
 from cnfp_torchrl.bijectors.region_squash import ExactSquash, GaugeSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
+from cnfp_torchrl.bijectors.soft_retraction import (
+    SHARPNESS,
+    SoftRetraction,
+    SoftSquash,
+    require_sharpness,
+)
 from cnfp_torchrl.bijectors.squashes import BallSquash, BoxSquash, EllipsoidSquash, paper_squash
 from cnfp_torchrl.bijectors.well_inside import reach, well_inside
 
 __all__ = [
+    "SHARPNESS",
     "BallSquash",
     "Bijector",
     "BoxSquash",
@@ -22,10 +29,13 @@ __all__ = [
     "RadialSquash",
     "Retraction",
     "ShellSquash",
+    "SoftRetraction",
+    "SoftSquash",
     "SquashChain",
     "Stages",
     "has_latent",
     "paper_squash",
     "reach",
+    "require_sharpness",
     "well_inside",
 ]

@@ -18,7 +18,7 @@ with needs_extra("train"):
     from cnfp_torchrl.commands.paths import takes_any_path
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.configuration import config_directory, require_settings
-    from cnfp_torchrl.training.agent import application_order, build_environment, load_actor
+    from cnfp_torchrl.training.agent import build_environment, load_actor
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.whole_file import write_json
 
@@ -37,7 +37,6 @@ def audit_configured(config: DictConfig) -> AuditReport:
     env = build_environment(audited, batch_size=[config.batch], with_anchor=True)
     return audit(
         env,
-        order=application_order(audited),
         flow=instantiate(audited.flow),
         actor=None if folder is None else load_actor(folder, audited, env),
         state_setter=instantiate(audited.env.get("state_setter")),

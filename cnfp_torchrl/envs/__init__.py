@@ -4,7 +4,12 @@ from cnfp_torchrl.envs.action_guard import ActionGuard
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
 from cnfp_torchrl.envs.constrain_env import constrain_env
 from cnfp_torchrl.envs.constrained_actions import ConstrainedActions
-from cnfp_torchrl.envs.cost import ConstraintCost, Indicator, constraint_names
+from cnfp_torchrl.envs.cost import (
+    ConstraintCost,
+    Indicator,
+    constraint_names,
+    counted_constraints,
+)
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
@@ -55,5 +60,6 @@ __all__ = [
     "constraint_bijectors",
     "constraint_names",
     "constraints_to_sample",
+    "counted_constraints",
     "find_task_view",
 ]

@@ -8,13 +8,23 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
-from cnfp_torchrl.modules import ConstraintPublisher, appended_transforms, constraint_bijectors
+from cnfp_torchrl.keys import refuse_string
+from cnfp_torchrl.modules import (
+    action_bounds,
+    constraint_bijectors,
+    in_order,
+    publishes_constraints,
+)
 
 _EXAMPLE = "write constrain_env(env, SpeedLimit(), KeepDistance())"
 
 
 def constrain_env(
-    env: EnvBase, *geometries: GeometryTransform, order: Sequence[str] | None = None
+    env: EnvBase,
+    *geometries: GeometryTransform,
+    order: Sequence[str] | None = None,
+    with_anchor: bool = True,
+    validate: bool | None = None,
 ) -> TransformedEnv:
     """Return an environment that publishes the geometry of its constraints in every state.
 
@@ -28,11 +38,16 @@ def constrain_env(
         geometries: One transform for each constraint.
         order: The constraints' names in order of application, the last with the highest priority
             (lexicographic priority); None takes the order of the geometries.
+        with_anchor: Whether to publish anchor, active flags and relaxations. Flows that guarantee
+            nothing (``squash``, ``unconstrained``) act without them, and steps take less time.
+        validate: Whether the values that the geometries read and return are checked at each step,
+            see `GeometryTransform`; None leaves that to each of them.
 
     Raises:
         TypeError: when the environment is no `EnvBase`, a geometry is no `GeometryTransform` (but
             a class or a list, for example), or the order is a string.
-        ValueError: without geometries, or when an order does not name each constraint once.
+        ValueError: without geometries, for an action spec that is not one of vectors with bounds,
+            or when an order does not name each constraint once.
     """
     if not isinstance(env, EnvBase):
         raise TypeError(
@@ -47,12 +62,28 @@ def constrain_env(
                 f"geometries: expected each to be a GeometryTransform, given {_kind(geometry)}; "
                 f"{_EXAMPLE}"
             )
-    publishes = any(isinstance(t, ConstraintPublisher) for t in appended_transforms(env))
-    before = constraint_bijectors(env) if publishes else []
+        if validate is not None:
+            geometry.validate = validate
+    action_bounds(env.full_action_spec, env.action_key)
+    before = constraint_bijectors(env) if publishes_constraints(env) else []
+    refuse_string("order", order)
+    if not with_anchor and order is not None:
+        # There is no anchor to state the priority, which is then that of the transforms.
+        wanted = {name: position for position, name in enumerate(order)}
+        geometries = tuple(sorted(geometries, key=lambda each: wanted.get(each.name, 0)))
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
     _ = published.observation_spec  # calls each geometry for its first set
     bijectors = [*before, *(own for geometry in geometries for own in geometry.bijectors)]
-    return published.append_transform(ConstraintAnchor(bijectors, order))
+    ordered = in_order(bijectors, order)
+    if with_anchor:
+        return published.append_transform(ConstraintAnchor(ordered))
+    if ordered != bijectors:
+        raise ValueError(
+            f"order: expected the constraints published before, {[each.name for each in before]}, "
+            f"to come first where there is no anchor, given {list(order or ())}; pass all "
+            "geometries to one constrain_env, or leave with_anchor as it is"
+        )
+    return published
 
 
 def _kind(given: object) -> str:

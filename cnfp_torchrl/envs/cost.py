@@ -173,3 +173,8 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
             f"with indicators), given {type(env).__name__}"
         )
     return tuple(names)
+
+
+def counted_constraints(env: EnvBase) -> tuple[str, ...]:
+    """Return the names of the columns of ``cost``; none if the environment counts nothing."""
+    return constraint_names(env) if COST_KEY in env.observation_spec.keys() else ()  # noqa: SIM118

@@ -19,6 +19,7 @@ from cnfp_torchrl.modules.flows import (
     GaugeFlow,
     ProjectionFlow,
     RadialFlow,
+    SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
     resolve_safe_flow,
@@ -34,18 +35,22 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.layer import ConstraintLayer
+from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
     changed_actions,
     constraint_bijectors,
+    publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
     "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintLayer",
     "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
@@ -60,7 +65,9 @@ __all__ = [
     "ProjectionFlow",
     "RadialFlow",
     "RelaxedConstraintError",
+    "SafeRandomLatents",
     "SafeRandomPolicy",
+    "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",
@@ -75,11 +82,13 @@ __all__ = [
     "has_density",
     "in_order",
     "make_constrained_actor",
+    "publishes_constraints",
     "refuse_exploration",
     "refuse_misfit",
     "refuse_other_bounds",
     "refuse_relaxed",
     "refuse_violations",
+    "require_fit",
     "resolve_safe_flow",
     "split_at_latent",
     "with_reference_entropy",

@@ -84,7 +84,8 @@ def action_bounds(spec: TensorSpec, action_key: NestedKey = ACTION_KEY) -> Box:
     if bounds is None:
         raise ValueError(
             f"spec of '{action_key}': expected a continuous spec of vectors with bounds on both "
-            f"sides, the first stage of every flow, {given}"
+            f"sides, the first stage of every flow, {given}; give the environment an action spec "
+            "such as torchrl.data.Bounded(low, high, (d,)), and discrete choices another actor"
         )
     if shape[:-1] != batch:
         raise ValueError(

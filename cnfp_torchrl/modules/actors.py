@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite, TensorSpec
@@ -24,6 +28,7 @@ from cnfp_torchrl.modules.constraint_bijector import ConstraintBijector, in_orde
 from cnfp_torchrl.modules.exploration import refuse_exploration
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, ReferenceEntropyFlowModule
 from cnfp_torchrl.modules.flows import Flow
+from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import constraint_bijectors
 
 
@@ -60,7 +65,8 @@ def make_constrained_actor(
         TypeError: when `env` is no environment, a sequence of names is a string, or a bijector is
             no `ConstraintBijector`.
         ValueError: when both or neither of `env` and `bijectors` with `spec` are given, when two
-            statements differ, or see `ConstrainedFlowModule`.
+            statements differ, when the network does not fit the environment, or see
+            `ConstrainedFlowModule`.
     """
     refuse_string("in_keys", in_keys)
     statement = _stated(env, bijectors, spec, order)
@@ -79,6 +85,8 @@ def make_constrained_actor(
         out_key=ACTION_KEY if env is None else env.action_key,
         return_log_prob=return_log_prob,
     )
+    if env is not None:
+        require_fit("network", parameters, env, head.parameter_keys, head.action_dim)
     return SafeProbabilisticTensorDictSequential(parameters, head)
 
 
@@ -119,7 +127,8 @@ def constrain(
             no environment, a bijector is no `ConstraintBijector`, or the order is a string.
         ValueError: when bounds are missing or are not those of the TanhNormal, when two statements
             differ, when the distribution is more than a Gaussian of location and scale, when an
-            order does not name each constraint once, or when there would be no constraint.
+            order does not name each constraint once, when the actor's networks do not fit the
+            environment, or when there would be no constraint.
     """
     *body, head = actor_modules(actor)
     parameter_keys = _parameter_keys(head)
@@ -158,6 +167,9 @@ def constrain(
         out_key=action_key,
         **_other_options(head),
     )
+    if env is not None:
+        network = TensorDictSequential(*body)
+        require_fit("actor", network, env, parameter_keys, constrained.action_dim)
     return SafeProbabilisticTensorDictSequential(*body, constrained)
 
 

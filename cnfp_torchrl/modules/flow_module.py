@@ -78,8 +78,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bijectors: One `ConstraintBijector` for each constraint.
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
-        flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``radial``,
-            ``squash``, ``projection``, ``unconstrained``.
+        flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``soft``,
+            ``radial``, ``squash``, ``projection``, ``unconstrained``.
         in_keys: The keys of the Gaussian's location and scale, each ``(*batch, d)``.
         out_key: The key of the action, ``(*batch, d)``.
         return_log_prob: Whether to write the action's log-density ``(*batch,)``, too.
@@ -198,6 +198,12 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bijector = self.get_bijector(tensordict)
         if self.flow.reads_constraints:
             refuse_other_batch(self.parameter_keys[0], loc, bijector.shape[:-1])
+        if loc.shape[-1] != self.action_dim or scale.shape[-1] not in (1, self.action_dim):
+            raise ValueError(
+                f"keys {self.parameter_keys}: expected a Gaussian of {self.action_dim} components, "
+                f"as the action has, given shapes {tuple(loc.shape)} and {tuple(scale.shape)}; "
+                "build the network for this action spec"
+            )
         base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
         distribution = self.distribution_type(base, bijector)
         if not self._has_warned:

@@ -10,14 +10,18 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from cnfp_torchrl.bijectors import (
+    SHARPNESS,
     Bijector,
     BoxSquash,
     ExactSquash,
     GaugeSquash,
     Projection,
     RadialSquash,
+    SoftRetraction,
+    SoftSquash,
     SquashChain,
     paper_squash,
+    require_sharpness,
 )
 from cnfp_torchrl.geometry import Ball, ConstraintSet, Region
 
@@ -31,6 +35,12 @@ class Flow(ABC):
     reads_constraints: ClassVar[bool] = True
     """Whether the constraints' sets are read."""
 
+    takes_actions: ClassVar[bool] = False
+    """Whether `of_actions` exists: the flow without a squash before it, for wished actions."""
+
+    reads_anchor: ClassVar[bool] = True
+    """Whether a safe flow takes gauges about the region's anchor."""
+
     has_density: ClassVar[bool] = True
     """Whether actions have a log-density; without one, only the reference entropy exists."""
 
@@ -42,6 +52,17 @@ class Flow(ABC):
             region: The action bounds and the constraints' sets in order of application. A safe flow
                 takes them as relaxed, and its anchor; other flows read the sets alone.
         """
+
+    def of_actions(self, region: Region) -> Bijector:
+        """Return the bijector of wished actions, in action units, which it leaves nearly alone.
+
+        Args:
+            region: As for a call; its bounds may be infinite.
+
+        Raises:
+            TypeError: when the flow squashes all of R^d instead.
+        """
+        raise TypeError(f"{type(self).__name__}: expected a flow that takes wished actions")
 
 
 class RegionFlow(Flow):
@@ -73,6 +94,41 @@ class GaugeFlow(RegionFlow):
     """
 
     squash = GaugeSquash
+
+
+class SoftFlow(RegionFlow):
+    """The exact flow with retractions that leave actions nearly as they are inside the region.
+
+    The retraction of `ExactFlow` shortens a whole ray, although only its end is forbidden; this one
+    shortens its end (`cnfp_torchrl.bijectors.SoftSquash`).
+
+    Args:
+        sharpness: The sharpness p, from 1 to 100. A larger one moves actions less, and puts more of
+            them on the boundary up to rounding.
+        by_components: Whether boxes retract each component by itself, not along the ray.
+    """
+
+    takes_actions = True
+
+    def __init__(self, sharpness: float = SHARPNESS, by_components: bool = True) -> None:
+        self.sharpness = require_sharpness(sharpness)
+        self.by_components = by_components
+
+    def __call__(self, region: Region) -> SoftSquash:
+        return SoftSquash(
+            region,
+            sharpness=self.sharpness,
+            by_components=self.by_components,
+            validate_args=False,
+        )
+
+    def of_actions(self, region: Region) -> SoftRetraction:
+        return SoftRetraction(
+            region,
+            sharpness=self.sharpness,
+            by_components=self.by_components,
+            validate_args=False,
+        )
 
 
 class RadialFlow(RegionFlow):
@@ -148,6 +204,7 @@ class UnconstrainedFlow(Flow):
 FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "gauge": GaugeFlow,
+    "soft": SoftFlow,
     "radial": RadialFlow,
     "squash": SquashFlow,
     "projection": ProjectionFlow,

@@ -66,6 +66,11 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
     return bijectors
 
 
+def publishes_constraints(env: EnvBase) -> bool:
+    """Tell whether an environment's own transforms publish any constraint."""
+    return any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
+
+
 def changed_actions(env: EnvBase) -> str | None:
     """Return the name of a transform that changes actions behind a `ConstraintAnchor`, or None."""
     transforms = iter(appended_transforms(env))

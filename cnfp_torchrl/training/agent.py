@@ -4,16 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
-from torchrl.envs import TransformedEnv
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
+from torchrl.objectives import LossModule
 
-from cnfp_torchrl.envs import RewardPenalty, constraint_bijectors
-from cnfp_torchrl.modules import Flow, make_constrained_actor
-from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
-from cnfp_torchrl.training.environment import counted_constraints, make_environment
+from cnfp_torchrl.envs import (
+    GeometryTransform,
+    RewardPenalty,
+    constrain_env,
+    counted_constraints,
+)
+from cnfp_torchrl.keys import OBSERVATION_KEY
+from cnfp_torchrl.modules import (
+    Flow,
+    make_constrained_actor,
+    publishes_constraints,
+    require_fit,
+)
+from cnfp_torchrl.objectives import SACLagrangianLoss
 from cnfp_torchrl.training.run_folder import RunFolder
 
 
@@ -21,6 +34,7 @@ def build_environment(
     config: DictConfig,
     *,
     batch_size: list[int] | None = None,
+    device: torch.device | str | None = None,
     with_anchor: bool = False,
     with_penalty: bool = False,
 ) -> TransformedEnv:
@@ -29,24 +43,50 @@ def build_environment(
     Args:
         config: configuration with the sections ``env`` and ``flow``.
         batch_size: batch size of environments that have one; None takes that of the configuration.
+        device: device of the environment, and of the actor and the critics made for it; None leaves
+            it where it is.
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
     """
-    flow: Flow = instantiate(config.flow)
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
         replaced["batch_size"] = batch_size
-    return make_environment(
-        instantiate(config.env.base, **replaced, _convert_="all"),
-        {
-            name: instantiate(section, _convert_="all")
-            for name, section in config.env.geometry.items()
-        },
-        order=application_order(config),
+    base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
+    bare = base.base_env if isinstance(base, TransformedEnv) else base
+    if replaced and isinstance(bare, ParallelEnv):
+        base.close()  # each of its environments is a process: no more of them than in training
+        base = instantiate(config.env.base, _convert_="all")
+    if device is not None:
+        base = base.to(device)
+    env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
+    penalty = _penalty(config) if with_penalty else None
+    if penalty is not None:  # behind the sum, which is of the reward without it
+        env.append_transform(penalty)
+    geometries = _geometries(config)
+    if not geometries:
+        return env
+    flow: Flow = instantiate(config.flow)
+    order = config.env.get("order")
+    return constrain_env(
+        env,
+        *geometries,
+        order=None if order is None else list(order),
         with_anchor=with_anchor or flow.is_safe,
-        penalty=_penalty(config) if with_penalty else None,
     )
+
+
+def _geometries(config: DictConfig) -> list[GeometryTransform]:
+    """Return the transforms that publish the constraints, in the order of the configuration."""
+    geometries = []
+    for name, section in config.env.get("geometry", {}).items():
+        geometry = instantiate(section, _convert_="all")
+        if geometry.name != name:
+            raise ValueError(
+                f"env.geometry.{name}.name: expected '{name}', given '{geometry.name}'"
+            )
+        geometries.append(geometry)
+    return geometries
 
 
 def _penalty(config: DictConfig) -> RewardPenalty | None:
@@ -57,51 +97,89 @@ def _penalty(config: DictConfig) -> RewardPenalty | None:
     return instantiate(penalty)
 
 
-def application_order(config: DictConfig) -> list[str]:
-    """Return the constraints in order of application: ``env.order``, else that of the geometry."""
-    return list(config.env.get("order", config.env.geometry))
-
-
 def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTensorDictSequential:
-    """Return the actor of a configuration for an environment."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
-    return make_constrained_actor(
-        instantiate(config.network.actor, observation_size, action_size),
-        bijectors=constraint_bijectors(env) if config.env.geometry else [],
-        spec=env.action_spec_unbatched,
-        order=application_order(config),
-        flow=instantiate(config.flow),
-    )
+    """Return the actor of a configuration for an environment.
+
+    Raises:
+        ValueError: when its network does not fit the environment.
+    """
+    flow: Flow = instantiate(config.flow)
+    network = _made(config.network.actor, env)
+    if flow.reads_constraints or publishes_constraints(env):
+        return make_constrained_actor(network, env, flow=flow)
+    return make_constrained_actor(network, bijectors=[], spec=env.action_spec_unbatched, flow=flow)
+
+
+def _made(section: DictConfig, env: TransformedEnv, *sizes: int) -> Any:
+    """Return a network of a configuration, on the environment's device."""
+    network = instantiate(section, *_sizes(env), *sizes)
+    return network if env.device is None else network.to(env.device)
+
+
+def _sizes(env: TransformedEnv) -> tuple[int, int]:
+    """Return the numbers of observed numbers and of action components.
+
+    Raises:
+        ValueError: when the environment observes no vector.
+    """
+    spec = env.observation_spec.get(OBSERVATION_KEY, None)
+    if spec is None or spec.ndim != len(env.batch_size) + 1 or not spec.dtype.is_floating_point:
+        kinds = {str(key): tuple(each.shape) for key, each in env.observation_spec.items()}
+        raise ValueError(
+            f"env.base: expected an environment that publishes a vector of floating numbers at "
+            f"{OBSERVATION_KEY!r}, given one that publishes {kinds}; concatenate what the networks "
+            "are to read with torchrl.envs.CatTensors(in_keys=[...], out_key='observation')"
+        )
+    return spec.shape[-1], env.action_spec_unbatched.shape[-1]
 
 
 def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     """Return the critic of a configuration for an environment."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
-    return instantiate(config.network.critic, observation_size, action_size)
+    critic = _made(config.network.critic, env)
+    require_fit("network.critic", critic, env, critic.out_keys[-1:], 1)
+    return critic
+
+
+def _require_output(critic: TensorDictModule, key: NestedKey) -> None:
+    """Refuse a critic that writes another entry than a loss reads.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if key not in critic.out_keys:
+        raise ValueError(
+            f"network.critic: expected one that writes {key!r}, as the loss reads it, given one "
+            f"that writes {critic.out_keys}; algorithm=sac, td3 and ppo bring networks that fit"
+        )
 
 
 def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
     """Return the critic of the costs that an environment counts."""
-    observation_size = env.observation_spec["observation"].shape[-1]
-    action_size = env.action_spec_unbatched.shape[-1]
     constraints = len(counted_constraints(env))
-    return instantiate(config.network.cost_critic, observation_size, action_size, constraints)
+    critic = _made(config.network.cost_critic, env, constraints)
+    require_fit("network.cost_critic", critic, env, critic.out_keys[-1:], constraints)
+    return critic
 
 
 def build_loss(
     config: DictConfig, env: TransformedEnv, actor: SafeProbabilisticTensorDictSequential
-) -> ConstrainedSACLoss:
+) -> LossModule:
     """Return the loss of a configuration, with critics of its own for the actor.
 
     Raises:
         ValueError: when the loss needs costs and the environment counts none.
     """
     make = instantiate(config.loss, _partial_=True)
-    networks: list[TensorDictModule] = [actor, build_critic(config, env)]
-    options: dict[str, Any] = {"action_spec": env.action_spec_unbatched}
-    if isinstance(make.func, type) and issubclass(make.func, SACLagrangianLoss):
+    critic = build_critic(config, env)
+    networks: list[TensorDictModule] = [actor, critic]
+    kind = make.func
+    default_keys: Any = getattr(kind, "default_keys", None)
+    if default_keys is not None:
+        keys = default_keys()
+        is_of_states = not hasattr(keys, "state_action_value")
+        _require_output(critic, keys.value if is_of_states else keys.state_action_value)
+    options: dict[str, Any] = {}
+    if isinstance(kind, type) and issubclass(kind, SACLagrangianLoss):
         options["constraint_names"] = counted_constraints(env)
         if not options["constraint_names"]:
             raise ValueError(

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import TaskView, find_task_view
+from cnfp_torchrl.envs import TaskView, counted_constraints, find_task_view
 from cnfp_torchrl.modules import ConstrainedFlowModule
-from cnfp_torchrl.training.environment import counted_constraints
 from cnfp_torchrl.visual.colors import constraint_colors
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 

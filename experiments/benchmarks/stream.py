@@ -31,9 +31,9 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, flow_blueprint
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -58,12 +58,7 @@ class StandardNormal(nn.Module):
 
 def pipeline() -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
     """Return point navigation with K = 2 constraints, and an actor for it."""
-    env = make_environment(
-        PointNavEnv([AGENTS], seed=0),
-        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
-        order=["battery", "obstacle"],
-        with_anchor=True,
-    )
+    env = constrain_env(PointNavEnv([AGENTS], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = make_constrained_actor(StandardNormal(), env)
     return env, actor
 

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from torch import Tensor, nn
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.envs import Marks, TaskView, find_task_view
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import FlowSnapshot, Scene, Setting, take_snapshot
 from cnfp_torchrl.visual.colors import INK, MUTED
 from cnfp_torchrl.visual.figures.canvas import house_style, save_png
@@ -205,14 +205,11 @@ class StandardNormal(nn.Module):
 
 def main(path: Path) -> None:
     """Draw an untrained policy in a state where both constraints bind."""
-    env = make_environment(
+    env = constrain_env(
         PointNavEnv(layout=LAYOUT, seed=0),
-        {
-            "battery": BatteryGeometry(LAYOUT, "battery"),
-            "obstacle": ObstacleGeometry(LAYOUT, "obstacle"),
-        },
+        BatteryGeometry(LAYOUT),
+        ObstacleGeometry(LAYOUT),
         order=ORDER,
-        with_anchor=True,
     )
     actor = make_constrained_actor(StandardNormal(), env)
     state = env.reset(position=POSITION, battery=BATTERY, goal=GOAL)

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.visual import FlowSnapshot, explain, take_snapshot
 from cnfp_torchrl.visual.figures import flow_stages
@@ -170,12 +170,7 @@ def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
 
 def snapshot(policy: KeptPolicy, name: str) -> FlowSnapshot:
     """Return the exact flow with the kept Gaussian of one of `PLACES`."""
-    env = make_environment(
-        PointNavEnv(seed=0),
-        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
-        order=ORDER,
-        with_anchor=True,
-    )
+    env = constrain_env(PointNavEnv(seed=0), BatteryGeometry(), ObstacleGeometry())
     kept = policy.gaussians[name]
     actor: SafeProbabilisticTensorDictSequential = make_constrained_actor(
         FixedGaussian(torch.tensor(kept.loc), torch.tensor(kept.scale)), env

@@ -22,7 +22,7 @@ def test_log_det_is_that_of_the_jacobian(case: Case) -> None:
     action, log_det = bijector.forward_and_log_det(z)
     expected = log_abs_det(bijector, z)
     # Autograd computes 1 - tanh(z)^2 by subtraction: at 8 it has lost 7 of its 16 digits.
-    assert (log_det - expected).abs().max() < 1e-9
+    assert (log_det - expected).abs().max() < 1e-9 + case.cancellation
     torch.testing.assert_close(bijector.log_abs_det_jacobian(z, action), log_det, rtol=0, atol=0)
 
 

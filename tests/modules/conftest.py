@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, SafeProbabilisticTensorDictSequential, TanhNormal
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import gaussian_network
 
 ORDER = ["battery", "obstacle"]
@@ -36,9 +36,8 @@ ActorFactory = Callable[..., SafeProbabilisticTensorDictSequential]
 
 
 def make_env(batch_size: tuple[int, ...] = (len(STATES),), **options: int) -> TransformedEnv:
-    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
     base = PointNavEnv(batch_size, seed=0, **options)
-    return make_environment(base, geometries, order=ORDER, with_anchor=True)
+    return constrain_env(base, ObstacleGeometry(), BatteryGeometry(), order=ORDER)
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import WarmUpPolicy, guarded, make_constrained_actor, split_at_latent
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import gaussian_network
 
 MakeActor = Callable[..., Any]
@@ -62,11 +62,7 @@ def test_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
 
 
 def _make_env(seed: int) -> TransformedEnv:
-    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
-    order = ["battery", "obstacle"]
-    return make_environment(
-        PointNavEnv((AGENTS,), seed=seed), geometries, order=order, with_anchor=True
-    )
+    return constrain_env(PointNavEnv((AGENTS,), seed=seed), BatteryGeometry(), ObstacleGeometry())
 
 
 @pytest.mark.slow

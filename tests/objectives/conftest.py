@@ -8,9 +8,9 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ValueOperator
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.training.networks import action_value_network, gaussian_network
 
 MakeActor = Callable[..., Any]
@@ -18,9 +18,8 @@ MakeActor = Callable[..., Any]
 
 @pytest.fixture
 def env() -> TransformedEnv:
-    geometries = {"obstacle": ObstacleGeometry(), "battery": BatteryGeometry()}
-    order = ["battery", "obstacle"]
-    return make_environment(PointNavEnv((64,), seed=0), geometries, order=order, with_anchor=True)
+    geometries = ObstacleGeometry(), BatteryGeometry()
+    return constrain_env(PointNavEnv((64,), seed=0), *geometries, order=["battery", "obstacle"])
 
 
 @pytest.fixture

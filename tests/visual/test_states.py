@@ -5,11 +5,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import GymEnv, TransformedEnv
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors, find_task_view
 from cnfp_torchrl.geometry import Ball, Box, Region
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual import telling_states
 from cnfp_torchrl.visual.states import openness
 
@@ -34,7 +34,7 @@ def point_nav(layout: Layout) -> TransformedEnv:
         "obstacle": ObstacleGeometry(layout, "obstacle"),
     }
     base = PointNavEnv([64], layout=layout, seed=0)
-    return make_environment(base, geometry, order=ORDER, with_anchor=True)
+    return constrain_env(base, *geometry.values(), order=ORDER)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -86,9 +86,7 @@ class SwingGently(GeometryTransform):
 
 
 def test_environment_without_a_map() -> None:
-    env = make_environment(
-        GymEnv("Pendulum-v1"), {"gentle": SwingGently("gentle")}, order=["gentle"], with_anchor=True
-    )
+    env = constrain_env(GymEnv("Pendulum-v1"), SwingGently("gentle"))
     env.set_seed(0)
     assert find_task_view(env).map is None
     permissive, restrictive = telling_states(env, head_of(env, ["gentle"]), steps=60)

@@ -12,20 +12,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, StreamTransform
 from tests.visual.cases import Gaussian, make_actor
 from tests.visual.rerun.recorded import compare, read, record
 
 
 def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
-    env = make_environment(
-        PointNavEnv(batch, seed=0, max_steps=4),
-        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
-        order=["battery", "obstacle"],
-        with_anchor=True,
+    env = constrain_env(
+        PointNavEnv(batch, seed=0, max_steps=4), BatteryGeometry(), ObstacleGeometry()
     )
     actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     return env, actor

@@ -10,9 +10,9 @@ import rerun as rr
 import torch
 from tensordict import TensorDict
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.rerun import FlowStream
@@ -101,11 +101,8 @@ def test_outline_of_the_battery_is_its_ball(tmp_path: Path) -> None:
 
 
 def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
-    env = make_environment(
-        PointNavEnv([2], seed=0, max_steps=3),
-        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
-        order=["battery", "obstacle"],
-        with_anchor=True,
+    env = constrain_env(
+        PointNavEnv([2], seed=0, max_steps=3), BatteryGeometry(), ObstacleGeometry()
     )
     actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     start = env.reset(position=(-0.5, 0.6), battery=30)

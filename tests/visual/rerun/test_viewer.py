@@ -11,9 +11,9 @@ import rerun as rr
 import torch
 from rerun.experimental import ViewerClient, ViewerState
 
+from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.environment import make_environment
 from cnfp_torchrl.visual.rerun import TRAINING_PLOTS, FlowStream, RerunLogger, flow_blueprint
 from tests.visual.cases import LINE, SPACE, Gaussian
 from tests.visual.rerun.recorded import RERUN, record, record_steps
@@ -82,12 +82,7 @@ def picture(viewer: ViewerClient, view_id: str, step: int) -> bytes:
 
 
 def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
-    env = make_environment(
-        PointNavEnv([1], seed=0),
-        {"battery": BatteryGeometry(name="battery"), "obstacle": ObstacleGeometry(name="obstacle")},
-        order=["battery", "obstacle"],
-        with_anchor=True,
-    )
+    env = constrain_env(PointNavEnv([1], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     rollout = env.rollout(STEPS, actor)[0]
 
