@@ -38,6 +38,7 @@ class VisibleRegion(ConstraintSet):
     step: Tensor
 
     event_dims: ClassVar[Mapping[str, int]] = {"position": 1, "rectangles": 3, "step": 0}
+    finite_fields: ClassVar[frozenset[str]] = frozenset({"position", "step"})
 
     @staticmethod
     def walls(low: Tensor, high: Tensor) -> Tensor:
@@ -59,14 +60,13 @@ class VisibleRegion(ConstraintSet):
         low, high = self.rectangles.unbind(-2)
         nowhere = (low > high) | (low == torch.inf) | (high == -torch.inf)
         everywhere = (low.isinf() & high.isinf()).all(-1, keepdim=True).expand_as(low)
-        yield "position", self.position.isinf(), "a finite position"
         yield (
             "rectangles",
             torch.stack([nowhere, nowhere], -2),
             "low <= high, not the same infinity",
         )
         yield "rectangles", torch.stack([everywhere, everywhere], -2), "a finite bound"
-        yield "step", (self.step <= 0) | self.step.isinf(), "a finite step > 0"
+        yield "step", self.step <= 0, "a finite step > 0"
 
     def shape_problem(self) -> str | None:
         count, corners = self.rectangles.shape[-3:-1]
@@ -254,6 +254,7 @@ class VisibleOrBox(ConstraintSet):
         **Box.event_dims,
         "in_sight": 0,
     }
+    finite_fields: ClassVar[frozenset[str]] = VisibleRegion.finite_fields | {"in_sight"}
 
     @property
     def region(self) -> VisibleRegion:

@@ -45,7 +45,7 @@ from cnfp_torchrl.modules.publisher import (
     constraint_bijectors,
     publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
     "ActionBounds",
@@ -67,6 +67,7 @@ __all__ = [
     "RadialFlow",
     "RecessionFlow",
     "RelaxedConstraintError",
+    "SafeRandomLatents",
     "SafeRandomPolicy",
     "SoftFlow",
     "SquashFlow",

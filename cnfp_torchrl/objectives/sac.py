@@ -12,12 +12,10 @@ from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     actor_modules,
-    has_density,
     with_reference_entropy,
 )
 from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
-
-Entropy = Literal["reference", "action"]
+from cnfp_torchrl.objectives.requirements import Entropy, require_discount, require_entropy
 
 
 class ConstrainedSACLoss(BatchedSACLoss):
@@ -59,15 +57,8 @@ class ConstrainedSACLoss(BatchedSACLoss):
         target_entropy: float | Literal["auto"] = "auto",
         **kwargs: Any,
     ) -> None:
-        if entropy not in ("reference", "action"):
-            raise ValueError(f"entropy: expected 'reference' or 'action', given {entropy!r}")
-        if not 0 <= gamma < 1:
-            raise ValueError(f"gamma: expected a discount in [0, 1), given {gamma}")
-        if entropy == "action" and not has_density(actor_network):
-            raise ValueError(
-                "entropy: expected 'reference' for an actor whose actions have no density, such as "
-                f"one that projects them, given {entropy!r}"
-            )
+        require_entropy(entropy, actor_network)
+        require_discount(gamma)
         scored = with_reference_entropy(actor_network) if entropy == "reference" else actor_network
         head = actor_modules(actor_network)[-1]
         if target_entropy == "auto" and isinstance(head, ConstrainedFlowModule):

@@ -8,8 +8,10 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
+from torchrl.objectives import LossModule
 
 from cnfp_torchrl.envs import (
     GeometryTransform,
@@ -24,7 +26,7 @@ from cnfp_torchrl.modules import (
     publishes_constraints,
     require_fit,
 )
-from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
+from cnfp_torchrl.objectives import SACLagrangianLoss
 from cnfp_torchrl.training.run_folder import RunFolder
 
 
@@ -138,6 +140,19 @@ def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     return critic
 
 
+def _require_output(critic: TensorDictModule, key: NestedKey) -> None:
+    """Refuse a critic that writes another entry than a loss reads.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if key not in critic.out_keys:
+        raise ValueError(
+            f"network.critic: expected one that writes {key!r}, as the loss reads it, given one "
+            f"that writes {critic.out_keys}; algorithm=sac, td3 and ppo bring networks that fit"
+        )
+
+
 def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
     """Return the critic of the costs that an environment counts."""
     constraints = len(counted_constraints(env))
@@ -148,16 +163,23 @@ def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModu
 
 def build_loss(
     config: DictConfig, env: TransformedEnv, actor: SafeProbabilisticTensorDictSequential
-) -> ConstrainedSACLoss:
+) -> LossModule:
     """Return the loss of a configuration, with critics of its own for the actor.
 
     Raises:
         ValueError: when the loss needs costs and the environment counts none.
     """
     make = instantiate(config.loss, _partial_=True)
-    networks: list[TensorDictModule] = [actor, build_critic(config, env)]
-    options: dict[str, Any] = {"action_spec": env.action_spec_unbatched}
-    if isinstance(make.func, type) and issubclass(make.func, SACLagrangianLoss):
+    critic = build_critic(config, env)
+    networks: list[TensorDictModule] = [actor, critic]
+    kind = make.func
+    default_keys: Any = getattr(kind, "default_keys", None)
+    if default_keys is not None:
+        keys = default_keys()
+        is_of_states = not hasattr(keys, "state_action_value")
+        _require_output(critic, keys.value if is_of_states else keys.state_action_value)
+    options: dict[str, Any] = {}
+    if isinstance(kind, type) and issubclass(kind, SACLagrangianLoss):
         options["constraint_names"] = counted_constraints(env)
         if not options["constraint_names"]:
             raise ValueError(

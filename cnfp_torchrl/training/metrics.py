@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.record.loggers import Logger, TensorboardLogger
+from torchrl.record.loggers import Logger, TensorboardLogger, WandbLogger
 from tqdm import tqdm
 
 from cnfp_torchrl.training.constraint_counts import (
@@ -154,8 +154,9 @@ class Metrics:
         """Finish the progress bar and end what the loggers started."""
         self._bar.close()
         for logger in self._loggers:
-            if isinstance(logger, TensorboardLogger):
-                logger.close()  # ends its thread, which would outlive the run
+            # Their threads and processes would outlive the run.
+            if isinstance(logger, TensorboardLogger | WandbLogger):
+                logger.close()
 
     def _log_entry(self) -> None:
         self._logged_at = self.frames

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pickle
 import shlex
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted,
 from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
+FAILURE = "failure.json"
 BEST = "best.pt"
 """The policy of the best score in training, in the form of the last one's `CHECKPOINT`."""
 STATES = "checkpoints"
@@ -272,6 +275,21 @@ class RunFolder:
             f"stopped and saved at step {frames}; go on with: "
             f"cnfp-train resume={shlex.quote(str(self.path))}"
         )
+
+    def save_failure(self, error: BaseException) -> None:
+        """Write why the run failed, as far as that can be written."""
+        with suppress(OSError):
+            write_json(self.path / FAILURE, {"reason": f"{type(error).__name__}: {error}"})
+
+    def load_failure(self) -> str | None:
+        """Return why the run failed; None where it has not."""
+        if not (self.path / FAILURE).is_file():
+            return None
+        return str(json.loads((self.path / FAILURE).read_text(encoding="utf-8"))["reason"])
+
+    def forget_failure(self) -> None:
+        """Remove what `save_failure` wrote, for a run that is tried again."""
+        (self.path / FAILURE).unlink(missing_ok=True)
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write the summary."""

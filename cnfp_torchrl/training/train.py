@@ -18,12 +18,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
-from cnfp_torchrl.keys import COST_KEY
-from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
+from cnfp_torchrl.modules import flow_head, guarded
 from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
-    build_loss,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -42,6 +40,7 @@ from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBegi
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
 from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
+from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
@@ -51,9 +50,6 @@ from cnfp_torchrl.training.settings import (
     TrainingSettings,
     require_frames,
 )
-from cnfp_torchrl.training.storage import prepare_buffer
-from cnfp_torchrl.training.stored_transitions import StoredTransitions
-from cnfp_torchrl.training.update import Update, UpdateBudget
 
 _log = logging.getLogger(__name__)
 
@@ -90,32 +86,17 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.threads)
 
-    # Environment, actor and loss
+    # Environment, actor, algorithm and collector
     env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
     tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
-    loss = build_loss(config, env, actor)
-    target = instantiate(config.target, _partial_=True)(loss)
-    optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
-    update = Update(loss, optimizer, target, compiled=config.compile)
-
-    # Collector and replay buffer
-    policy = WarmUpPolicy(actor, settings.warmup_frames)
-    if config.compile:
-        # Not the policy around it, which counts: a number that changes would be compiled anew.
-        policy.actor = torch.compile(actor)
-    collector = instantiate(config.collector, _partial_=True)(env, policy)
-    # A collector tries its policy once when it is made, which is not a step of the warm-up.
-    policy.frames_left = settings.warmup_frames
-    buffer = instantiate(config.replay_buffer)
-    stored = prepare_buffer(
-        buffer,
-        env,
-        actor.in_keys,
-        other_keys=[key for key in [("next", COST_KEY)] if key in loss.in_keys],
-        constraint_bytes=settings.constraint_bytes,
+    is_saved = saving.interval is not None
+    learner: Learner = instantiate(config.algorithm, _partial_=True)(
+        config, env, actor, folder.path / STATES if is_saved else None
     )
+    collector = instantiate(config.collector, _partial_=True)(env, learner.policy)
+    learner.begin()
 
     # Callback and loggers
     state = RunState(folder, saving)
@@ -147,10 +128,8 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     )
 
     # What the run goes on from
-    is_saved = saving.interval is not None
-    transitions = StoredTransitions(buffer, folder.path / STATES, is_saved=is_saved)
-    budget = UpdateBudget(settings.update_ratio)
-    best = BestPolicy(folder, actor=actor, loss=loss, optimizer=optimizer)
+    trained = {"actor": actor, "loss": learner.loss, "optimizer": learner.optimizer}
+    best = BestPolicy(folder, **trained)
     episodes = CollectorState(collector, env)
     evaluations = IntervalEvaluation(
         partial(_evaluation_environment, config, evaluation.interval_episodes),
@@ -160,18 +139,15 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     )
     state.restore(
         {
-            "actor": actor,
-            "loss": loss,
-            "optimizer": optimizer,
-            "warm_up": Attributes(policy, "frames_left"),
-            "budget": Attributes(budget, "due"),
+            **trained,
+            **learner.components(),
             "best": Attributes(best, "score", "violations"),
             "evaluations": Attributes(evaluations, "history"),
             "metrics": metrics,
             "collector": episodes,
             "random": GlobalRNGState(),
         },
-        transitions,
+        learner.transitions,
     )
     if resume:
         callback.continue_at(metrics.frames)
@@ -188,13 +164,9 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
             for collected in collector:
                 callback.on_batch(collected)
-                batch = collected.reshape(-1)
-                metrics.add_steps(batch)
-                transitions.extend(batch.select(*stored))
-                if metrics.frames >= settings.warmup_frames:
-                    budget.earn(batch.numel())
-                    while budget.spend():
-                        metrics.add_losses(update(buffer.sample()))
+                metrics.add_steps(collected.reshape(-1))
+                for losses in learner.learn(collected, metrics.frames):
+                    metrics.add_losses(losses)
                 metrics.log_if_due()
                 if (report := evaluations.run_if_due(metrics.frames)) is not None:
                     metrics.add_evaluation(report)
@@ -209,7 +181,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             metrics.finish()
         collector.shutdown()
         # Before anything else that may fail or be interrupted.
-        folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
+        folder.save_checkpoint(**trained)
 
         # Evaluation
         summary = {

@@ -16,11 +16,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Self, TypeAlias
 
-import torch
-from torch import Tensor
-from torch.linalg import vector_norm
+import numpy as np
 
-from cnfp_torchrl.geometry.anchor.program import Program
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program, length, times
 
 MAX_ITERATIONS = 60
 """The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
@@ -28,20 +26,23 @@ MAX_ITERATIONS = 60
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
 
+_SMALL = 8
+"""The largest number of unknowns for which elimination side by side is the fastest."""
+
 
 class Best(NamedTuple):
     """The best found actions ``(B, d)``, their slacks, and upper bounds of the slack ``(B,)``."""
 
-    action: Tensor
-    slack: Tensor
-    upper_bound: Tensor
+    action: Array
+    slack: Array
+    upper_bound: Array
 
 
-Settled: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+Settled: TypeAlias = Callable[[Array, Array, Index], Flags]
 """From lower and upper bounds of the best t, and the problems' indices: which need no more work."""
 
 
-def maximize_slack(problem: Program, start: Tensor, settled: Settled) -> Best:
+def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
     Stops for each problem as soon as its bounds say enough: at once where a set is so far from the
@@ -50,38 +51,37 @@ def maximize_slack(problem: Program, start: Tensor, settled: Settled) -> Best:
     its slack is true, and no more is claimed for the upper bound.
 
     Args:
-        problem: B problems in float64, with rows that bound the actions on all sides.
+        problem: B problems, with rows that bound the actions on all sides.
         start: points strictly inside of what is not on trial, ``(B, d)``.
         settled: function that tells which problems need no more work.
     """
-    unit = problem.unit.squeeze(-1)
-    x = problem.start(start)
-    found, largest, bound = x.clone(), torch.empty_like(unit), torch.empty_like(unit)
-    left = torch.arange(len(start), device=start.device)
-    path = _Path.begin(problem, x)
-    lower, upper, best = x[:, problem.dim, 0] + 1, problem.bound(), x
-    for iteration in range(MAX_ITERATIONS + 1):
-        scale = unit[left]
-        undecided = ~settled(lower * scale, upper * scale, left)
-        count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
-        if count <= len(left) // 2:
-            # Until then those that are settled go on with the others, but count no more.
-            found = found.index_copy(0, left, best)
-            largest = largest.index_copy(0, left, lower * scale)
-            bound = bound.index_copy(0, left, upper * scale)
-            if not count:
-                break
-            path, left, best = path.select(undecided), left[undecided], best[undecided]
-            lower, upper = lower[undecided], upper[undecided]
-            undecided = undecided[undecided]
-        slack, height = path.slacks()
-        least, above, product = path.bounds(slack, height)
-        better = undecided & (least > lower)
-        best = torch.where(better[:, None, None], path.x, best)
-        lower = torch.where(better, least, lower)
-        upper = torch.where(undecided & (above < upper), above, upper)
-        path.advance(slack, height, product)
-    return Best(problem.action(found), largest, bound)
+    # Some of the problems that go on after they are settled may end in infinities.
+    with np.errstate(all="ignore"):
+        x = problem.start(start)
+        found, largest, bound = x.copy(), np.empty(len(start)), np.empty(len(start))
+        left = np.arange(len(start))
+        path = _Path.begin(problem, x)
+        lower, upper, best = x[problem.dim] + 1, problem.bound(), x
+        for iteration in range(MAX_ITERATIONS + 1):
+            scale = problem.unit[left]
+            undecided = ~settled(lower * scale, upper * scale, left)
+            count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
+            if count <= len(left) // 2:
+                # Until then those that are settled go on with the others, but count no more.
+                found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
+                if not count:
+                    break
+                path, left, best = path.select(undecided), left[undecided], best[:, undecided]
+                lower, upper = lower[undecided], upper[undecided]
+                undecided = undecided[undecided]
+            slack, height = path.slacks()
+            least, above, product = path.bounds(slack, height)
+            better = undecided & (least > lower)
+            best = np.where(better, path.x, best)
+            lower = np.where(better, least, lower)
+            upper = np.where(undecided & (above < upper), above, upper)
+            path.advance(slack, height, product)
+        return Best(problem.action(found), largest, bound)
 
 
 @dataclass(eq=False)
@@ -89,206 +89,261 @@ class _Path:
     """Points and weights of B problems on their way.
 
     Args:
-        rows: rows of the program, ``(B, M, n)``.
-        offsets: their offsets, ``(B, M, 1)``.
-        cones: cones of the program, ``(B, J, 1 + k, n)``.
-        tips: their constants, ``(B, J, 1 + k, 1)``.
-        spare: 0 for what is on trial and infinite for the others, ``(B, M + J, 1)``.
-        low: least values of all unknowns but t, ``(B, n, 1)``.
-        high: largest values of all unknowns but t, ``(B, n, 1)``.
-        x: unknowns, ``(B, n, 1)``.
-        weights: weights of the rows, ``(B, M, 1)``.
-        duals: weights of the cones, ``(B, J, 1 + k, 1)``.
+        rows: rows of the program, ``(M, n, B)``.
+        offsets: their offsets, ``(M, B)``.
+        cones: cones of the program, ``(J, 1 + k, n, B)``.
+        tips: their constants, ``(J, 1 + k, B)``.
+        spare: 0 for what is on trial and infinite for the others, ``(M + J, B)``.
+        low: least values of all unknowns but t, ``(n, B)``.
+        high: largest values of all unknowns but t, ``(n, B)``.
+        x: unknowns, ``(n, B)``.
+        weights: weights of the rows, ``(M, B)``.
+        duals: weights of the cones, ``(J, 1 + k, B)``.
         dim: number d of components of an action, after which t stands in x.
     """
 
-    rows: Tensor
-    offsets: Tensor
-    cones: Tensor
-    tips: Tensor
-    spare: Tensor
-    low: Tensor
-    high: Tensor
-    x: Tensor
-    weights: Tensor
-    duals: Tensor
+    rows: Array
+    offsets: Array
+    cones: Array
+    tips: Array
+    spare: Array
+    low: Array
+    high: Array
+    x: Array
+    weights: Array
+    duals: Array
     dim: int
 
     @classmethod
-    def begin(cls, problem: Program, x: Tensor) -> Self:
+    def begin(cls, problem: Program, x: Array) -> Self:
         """Return the paths from points on, with weights for which the points are best in t."""
-        dim, reach = problem.dim, problem.term_reach.unsqueeze(-1)
-        one, zero = torch.ones_like(x[:, :dim]), torch.zeros_like(x[:, :1])
-        rates = torch.cat([problem.rows[:, :, dim], problem.cones[:, :, 0, dim]], 1).unsqueeze(-1)
+        dim = problem.dim
+        rates = np.concatenate([problem.rows[:, dim], problem.cones[:, 0, dim]])
+        low, high = np.zeros_like(x), np.ones_like(x)
+        low[:dim], high[dim + 1 :] = -1, problem.reach
         path = cls(
             rows=problem.rows,
             offsets=problem.offsets,
             cones=problem.cones,
             tips=problem.tips,
-            spare=torch.zeros_like(rates).masked_fill(rates == 0, torch.inf),
-            low=torch.cat([-one, zero, torch.zeros_like(reach)], 1),
-            high=torch.cat([one, zero, 2 * reach], 1),
+            spare=np.where(rates > 0, 0.0, np.inf),
+            low=low,
+            high=high,
             x=x,
             weights=problem.offsets,
             duals=problem.tips,
             dim=dim,
         )
         slack, height = path.slacks()
-        weights, duals = slack.reciprocal(), _flipped(height) / _det(height)
-        pull = (torch.cat([weights, duals[:, :, 0]], 1) * rates).sum(1, keepdim=True)
-        path.weights, path.duals = weights / pull, duals / pull.unsqueeze(1)
+        weights, duals = 1 / slack, _flipped(height) / _det(height)[:, None]
+        pull = (np.concatenate([weights, duals[:, 0]]) * rates).sum(0)
+        path.weights, path.duals = weights / pull, duals / pull
         return path
 
-    def select(self, keep: Tensor) -> Self:
+    def select(self, keep: Flags) -> Self:
         """Return some of the B paths."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self)(**{n: v if n == "dim" else v[keep] for n, v in values.items()})
+        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values.items()})
 
-    def slacks(self) -> tuple[Tensor, Tensor]:
-        """Return the slacks of rows ``(B, M, 1)`` and of cones ``(B, J, 1 + k, 1)``."""
-        slack = torch.baddbmm(self.offsets, self.rows, self.x, alpha=-1)
-        if not self.cones.shape[1]:
-            return slack, self.tips
-        return slack, self.tips - self.cones @ self.x.unsqueeze(1)
+    def slacks(self) -> tuple[Array, Array]:
+        """Return the slacks of rows ``(M, B)`` and of cones ``(J, 1 + k, B)``."""
+        slack = self.offsets - times(self.rows, self.x)
+        return slack, self.tips - times(self.cones, self.x) if len(self.cones) else self.tips
 
-    def bounds(self, slack: Tensor, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return bounds of the best t, ``(B,)`` each, and the weighted sums of all slacks."""
-        rooms, pull = slack, self.rows.mT @ self.weights
-        product = slack.mT @ self.weights
-        if self.cones.shape[1]:
-            rooms = torch.cat([slack, height[:, :, 0] - vector_norm(height[:, :, 1:], dim=2)], 1)
-            product = product + (height * self.duals).sum((1, 2)).unsqueeze(-1)
-            pull = pull + (self.cones.mT @ self.duals).sum(1)
+    def bounds(self, slack: Array, height: Array) -> tuple[Array, Array, Array]:
+        """Return bounds of the best t, and the weighted sums of all slacks, ``(B,)`` each."""
+        rooms, pull = slack, _pulled(self.rows, self.weights)
+        product = (slack * self.weights).sum(0)
+        if len(self.cones):
+            rooms = np.concatenate([slack, height[:, 0] - length(height[:, 1:])])
+            product = product + (height * self.duals).sum((0, 1))
+            pull = pull + _pulled(_side_by_side(self.cones), _side_by_side(self.duals))
         # What the weighted mean of all slacks may become within the bounds.
-        rest = torch.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
-        rest[:, self.dim] = product.squeeze(-1)
-        t = self.x[:, self.dim, 0]
-        upper = t + (rest.sum(1) / pull[:, self.dim]).squeeze(-1)
-        return t + (rooms + self.spare).amin((1, 2)), upper, product
+        rest = np.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
+        rest[self.dim] = product
+        t = self.x[self.dim]
+        return t + (rooms + self.spare).min(0), t + rest.sum(0) / pull[self.dim], product
 
-    def advance(self, slack: Tensor, height: Tensor, product: Tensor) -> None:
+    def advance(self, slack: Array, height: Array, product: Array) -> None:
         """Take a step, from slacks and their weighted sums."""
-        count = slack.shape[1]
-        root = (self.weights / slack).sqrt()
-        scaled, point = self.rows * root, slack * root
-        scaling = ConeScaling.between(height, self.duals) if self.cones.shape[1] else None
+        count = len(slack)
+        root = np.sqrt(self.weights / slack)
+        scaled, point = self.rows * root[:, None], slack * root
+        scaling = ConeScaling.between(height, self.duals) if len(self.cones) else None
         if scaling is not None:
-            scaled = torch.cat([scaled, scaling.unscaled(self.cones).flatten(1, 2)], 1)
-            point = torch.cat([point, scaling.scaled(self.duals).flatten(1, 2)], 1)
-        factor = _factor(scaled.mT @ scaled)
-        goal = torch.zeros_like(self.x)
-        goal[:, self.dim] = 1
-        fall = scaled @ torch.cholesky_solve(goal, factor)
-        share = 1 / torch.maximum(*self._limits(point, fall, point - fall)).clamp(min=1)
+            cones = [scaling.unscaled(self.cones), scaling.scaled(self.duals)]
+            scaled = np.concatenate([scaled, _side_by_side(cones[0])])
+            point = np.concatenate([point, _side_by_side(cones[1])])
+        matrix = _Normal.of(scaled)
+        goal = np.zeros_like(self.x)
+        goal[self.dim] = 1
+        fall = times(scaled, matrix.solve(goal))
+        share = 1 / np.maximum(self._limits(point, np.stack([fall, point - fall])).max(0), 1)
         # The less a step without centering would gain, the more centering there is.
-        center = (1 - share) ** 3 * (product / (count + self.cones.shape[1]))
-        squared = fall * (fall - point)
-        aim = (center + squared[:, :count]) / point[:, :count]
+        center = (1 - share) ** 3 * (product / (count + len(self.cones)))
+        aim = (center + (fall * (fall - point))[:count]) / point[:count]
         if scaling is not None:
-            own, falls = (v[:, count:].view_as(height) for v in (point, fall))
+            own, falls = (v[count:].reshape(height.shape) for v in (point, fall))
             wanted = _product(falls, falls - own)
-            wanted[:, :, :1] += center.unsqueeze(1)
-            aim = torch.cat([aim, _quotient(wanted, own).flatten(1, 2)], 1)
-        move = torch.cholesky_solve(torch.baddbmm(goal, scaled.mT, aim, alpha=-1), factor)
-        fall = scaled @ move
+            wanted[:, 0] += center
+            aim = np.concatenate([aim, _side_by_side(_quotient(wanted, own))])
+        move = matrix.solve(goal - _pulled(scaled, aim))
+        fall = times(scaled, move)
         loss = point - aim - fall
-        limits = self._limits(point, fall, loss)
+        limits = self._limits(point, np.stack([fall, loss]))
         if scaling is not None:
-            limits = (torch.maximum(*limits),) * 2
-        ahead, along = (_FRACTION / limit.clamp(min=_FRACTION) for limit in limits)
-        self.x = torch.addcmul(self.x, ahead, move)
-        self.weights = torch.addcmul(self.weights, along, root * loss[:, :count], value=-1)
+            limits[:] = limits.max(0)
+        ahead, along = _FRACTION / np.maximum(limits, _FRACTION)
+        self.x = self.x + ahead * move
+        self.weights = self.weights - along * (root * loss[:count])
         if scaling is not None:
-            change = scaling.unscaled(loss[:, count:].view_as(height))
-            self.duals = torch.addcmul(self.duals, along.unsqueeze(1), change, value=-1)
+            change = scaling.unscaled(loss[count:].reshape(height.shape))
+            self.duals = self.duals - along * change
 
-    def _limits(self, point: Tensor, fall: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inverse of the largest steps of slacks and weights, ``(B, 1, 1)`` each.
+    def _limits(self, point: Array, changes: Array) -> Array:
+        """Return the inverse of the largest steps of slacks and weights, ``(2, B)``.
 
         Args:
             point: slacks, which are as large as the weights, in the scaling of the step.
-            fall: what a step takes off the slacks.
-            loss: what a step takes off the weights.
+            changes: what a step takes off the slacks and off the weights.
         """
-        count, changes = self.rows.shape[1], torch.stack([fall, loss])
-        limits = (changes[:, :, :count] / point[:, :count]).amax(2, keepdim=True)
-        if self.cones.shape[1]:
-            changes = changes[:, :, count:].unflatten(2, self.duals.shape[1:3])
-            own = point[:, count:].view_as(self.duals)
-            # A cone is left where own - step * changes has a determinant of 0, a quadratic.
-            det, along = _det(own), _dot(_flipped(own), changes)
-            squared = _dot(_flipped(changes), changes)
-            steepest = (along + (along.square() - squared * det).relu().sqrt()) / det
-            limits = torch.maximum(limits, steepest.amax(2))
-        return limits[0], limits[1]
+        count = len(self.rows)
+        limits = (changes[:, :count] / point[:count]).max(1)
+        if len(self.cones):
+            own = point[count:].reshape(self.duals.shape)
+            falls = changes[:, count:].reshape(2, *self.duals.shape)
+            # A cone is left where own - step * falls has a determinant of 0, a quadratic.
+            det, along = _det(own), (_flipped(own) * falls).sum(2)
+            squared = np.square(falls[:, :, 0]) - np.square(falls[:, :, 1:]).sum(2)
+            steepest = (along + np.sqrt(np.maximum(along * along - squared * det, 0))) / det
+            limits = np.maximum(limits, steepest.max(1))
+        return limits
 
 
 class ConeScaling(NamedTuple):
-    r"""The scaling of cones in which a slack s is as large as its weight z.
+    r"""The symmetric scaling W of cones with :math:`W z = W^{-1} s` for slacks s and weights z.
 
-    :math:`W = \eta\,(2 v v^T - J)` with :math:`W z = W^{-1} s`, and W's root w as its axis.
+    Args:
+        head: first components of the axes, which are of determinant 1, ``(J, B)``.
+        tail: other components of the axes, ``(J, k, B)``.
+        size: sizes ``(J, B)``.
     """
 
-    head: Tensor
-    tail: Tensor
-    size: Tensor
+    head: Array
+    tail: Array
+    size: Array
 
     @classmethod
-    def between(cls, slack: Tensor, weight: Tensor) -> Self:
-        """Return the scaling for slacks and weights ``(B, J, 1 + k, 1)`` inside of the cones."""
+    def between(cls, slack: Array, weight: Array) -> Self:
+        """Return the scaling for slacks and weights ``(J, 1 + k, B)`` inside of the cones."""
         of_slack, of_weight = _det(slack), _det(weight)
-        s, z = slack * of_slack.rsqrt(), weight * of_weight.rsqrt()
-        axis = (s + _flipped(z)) * (2 + 2 * _dot(s, z)).rsqrt()
-        return cls(axis[:, :, :1], axis[:, :, 1:], (of_slack / of_weight) ** 0.25)
+        s, z = slack / np.sqrt(of_slack)[:, None], weight / np.sqrt(of_weight)[:, None]
+        axis = (s + _flipped(z)) / np.sqrt(2 + 2 * (s * z).sum(1))[:, None]
+        return cls(axis[:, 0], axis[:, 1:], np.sqrt(np.sqrt(of_slack / of_weight)))
 
-    def scaled(self, v: Tensor) -> Tensor:
-        """Return W v."""
-        first, dot = v[:, :, :1], _dot(self.tail, v[:, :, 1:])
-        rest = v[:, :, 1:] + (first + dot / (1 + self.head)) * self.tail
-        return self.size * torch.cat([self.head * first + dot, rest], 2)
+    def scaled(self, v: Array) -> Array:
+        """Return W v, of vectors ``(J, 1 + k, B)``."""
+        dot = (self.tail * v[:, 1:]).sum(1)
+        result = np.empty_like(v)
+        result[:, 0] = self.head * v[:, 0] + dot
+        result[:, 1:] = v[:, 1:] + (v[:, 0] + dot / (1 + self.head))[:, None] * self.tail
+        return result * self.size[:, None]
 
-    def unscaled(self, v: Tensor) -> Tensor:
-        """Return the inverse of W times v."""
-        first, dot = v[:, :, :1], _dot(self.tail, v[:, :, 1:])
-        rest = v[:, :, 1:] + (dot / (1 + self.head) - first) * self.tail
-        return torch.cat([self.head * first - dot, rest], 2) / self.size
-
-
-def _dot(u: Tensor, v: Tensor) -> Tensor:
-    return (u * v).sum(-2, keepdim=True)
-
-
-def _flipped(v: Tensor) -> Tensor:
-    """Return vectors ``(..., 1 + k, 1)`` with the sign of all but their first component changed."""
-    return torch.cat([v[..., :1, :], -v[..., 1:, :]], -2)
+    def unscaled(self, v: Array) -> Array:
+        """Return the inverse of W times v, of vectors ``(J, 1 + k, B)`` or ``(J, 1 + k, n, B)``."""
+        head, tail, size = self
+        if v.ndim == 4:
+            head, tail, size = head[:, None], tail[:, :, None], size[:, None]
+        dot = (tail * v[:, 1:]).sum(1)
+        result = np.empty_like(v)
+        result[:, 0] = head * v[:, 0] - dot
+        result[:, 1:] = v[:, 1:] + (dot / (1 + head) - v[:, 0])[:, None] * tail
+        return result / size[:, None]
 
 
-def _det(v: Tensor) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Matrices ``S^T S``, factorized as ``U^T D U`` where they are small.
+
+    Args:
+        matrix: matrices ``(B, n, n)``, if they are not factorized.
+        rows: rows of U right of its diagonal of ones.
+        diagonal: diagonal of D, ``(B,)`` each.
+    """
+
+    matrix: Array | None
+    rows: list[Array]
+    diagonal: list[Array]
+
+    @classmethod
+    def of(cls, scaled: Array) -> Self:
+        """Return the matrices for S, ``(m, n, B)``."""
+        if scaled.shape[1] > _SMALL:
+            first = np.ascontiguousarray(scaled.transpose(2, 0, 1))
+            matrix = first.transpose(0, 2, 1) @ first
+            # Rounding may have made a matrix singular.
+            each = np.arange(scaled.shape[1])
+            matrix[:, each, each] *= 1 + 1e-14
+            # Of problems that went on after they were settled, which no longer count.
+            matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
+            return cls(matrix, [], [])
+        rest = np.einsum("mib,mjb->ijb", scaled, scaled)
+        rows, diagonal = [], []
+        for least in 1e-15 * np.einsum("iib->ib", rest):
+            # Where rounding made a matrix indefinite, t still grows along the direction.
+            pivot = np.maximum(rest[0, 0], least)
+            row = rest[0, 1:] / pivot
+            rest = rest[1:, 1:] - rest[1:, :1] * row
+            rows.append(row)
+            diagonal.append(pivot)
+        return cls(None, rows, diagonal)
+
+    def solve(self, right: Array) -> Array:
+        """Return the solutions for right-hand sides ``(n, B)``."""
+        if self.matrix is not None:
+            solution = np.linalg.solve(self.matrix, right.T[..., None])
+            return np.asarray(solution[..., 0].T, dtype=np.float64)
+        x = right.copy()
+        for i, row in enumerate(self.rows):
+            x[i + 1 :] -= row * x[i]
+        for i in range(len(x) - 1, -1, -1):
+            x[i] = x[i] / self.diagonal[i] - (self.rows[i] * x[i + 1 :]).sum(0)
+        return x
+
+
+def _pulled(matrix: Array, weights: Array) -> Array:
+    """Return the product of transposed matrices ``(m, n, B)`` with vectors ``(m, B)``."""
+    return np.asarray(np.einsum("mib,mb->ib", matrix, weights), dtype=np.float64)
+
+
+def _side_by_side(v: Array) -> Array:
+    """Return vectors or matrices ``(J, 1 + k, ...)`` of all cones as ``(J (1 + k), ...)``."""
+    return v.reshape(-1, *v.shape[2:])
+
+
+def _flipped(v: Array) -> Array:
+    """Return vectors ``(J, 1 + k, B)`` with the sign of all but their first component changed."""
+    result = -v
+    result[:, 0] = v[:, 0]
+    return result
+
+
+def _det(v: Array) -> Array:
     """Return the square of the first component less that of the length of the others."""
-    length = vector_norm(v[..., 1:, :], dim=-2, keepdim=True)
-    return (v[..., :1, :] - length) * (v[..., :1, :] + length)
+    size = length(v[:, 1:])
+    return (v[:, 0] - size) * (v[:, 0] + size)
 
 
-def _product(u: Tensor, v: Tensor) -> Tensor:
+def _product(u: Array, v: Array) -> Array:
     """Return the Jordan product of vectors of cones."""
-    rest = u[:, :, :1] * v[:, :, 1:] + v[:, :, :1] * u[:, :, 1:]
-    return torch.cat([_dot(u, v), rest], 2)
+    result = u[:, :1] * v + v[:, :1] * u
+    result[:, 0] = (u * v).sum(1)
+    return result
 
 
-def _quotient(u: Tensor, v: Tensor) -> Tensor:
+def _quotient(u: Array, v: Array) -> Array:
     """Return what gives u when multiplied by v, by the Jordan product."""
-    first = _dot(_flipped(v), u) / _det(v)
-    return torch.cat([first, (u[:, :, 1:] - first * v[:, :, 1:]) / v[:, :, :1]], 2)
-
-
-def _factor(hessian: Tensor) -> Tensor:
-    """Return the Cholesky factor of matrices that are positive definite but for rounding."""
-    factor, failed = torch.linalg.cholesky_ex(hessian)
-    if bool(failed.any()):
-        # A shift of the size of the rounding gives a direction in which t grows, and where not even
-        # that helps, the diagonal does.
-        diagonal = torch.diag_embed(hessian.diagonal(dim1=-2, dim2=-1))
-        shifted, hopeless = torch.linalg.cholesky_ex(hessian + 1e-9 * diagonal)
-        shifted = torch.where((hopeless > 0)[:, None, None], diagonal.sqrt(), shifted)
-        factor = torch.where((failed > 0)[:, None, None], shifted, factor)
-    return factor
+    first = ((_flipped(v) * u).sum(1) / _det(v))[:, None]
+    result = (u - first * v) / v[:, :1]
+    result[:, :1] = first
+    return result

@@ -3,239 +3,238 @@ r"""Problems of the largest smallest slack, as rows and second-order cones in on
 A problem's unknowns are :math:`x = (a, t, u)`: the action in half widths of the bounds about their
 middle, the slack t in mean half widths, and bounds u of the terms of kinked sums, of which each
 makes two rows, :math:`\alpha_i a_i \le u_i` and :math:`\beta_i a_i \le u_i`.
+
+The arrays are NumPy's, in float64, because a few small problems take a third of the time that way,
+and the batch comes last in those of a program, because many of them are solved side by side.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Self, TypeAlias
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
-from torch.linalg import vector_norm
-from torch.nn.functional import pad
 
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
+
+Array: TypeAlias = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+Index: TypeAlias = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
     """B problems "maximize t such that all sets have slack t".
 
-    Fields carry B first. All slacks grow at the rate of one: a row or cone with a 0 for t must hold
-    whatever t is. One that does not count has no coefficients, and holds by 1 everywhere.
+    All slacks grow at the rate of one: a row or cone with a 0 for t must hold whatever t is. One
+    that does not count has no coefficients, and holds by 1 everywhere.
 
     Args:
-        rows: coefficients of ``rows @ x <= offsets``, ``(B, M, n)``: the terms of kinked sums, the
+        rows: coefficients of ``rows @ x <= offsets``, ``(M, n, B)``: the terms of kinked sums, the
             sums, and other rows.
-        offsets: offsets of the rows, ``(B, M, 1)``.
-        loose: offsets that let every action pass, for rows that do not count, ``(B, M, 1)``.
+        offsets: offsets of the rows, ``(M, B)``.
+        loose: offsets that let every action pass, for rows that do not count, ``(M, B)``.
         cones: coefficients of ``tips - cones @ x``, whose first component is no less than the norm
-            of the others, ``(B, J, 1 + k, n)``.
-        tips: constants of the cones, ``(B, J, 1 + k, 1)``.
-        middle: middles of the bounds, ``(B, d)``.
-        half: half widths of the bounds, ``(B, d)``.
-        unit: mean half widths, ``(B, 1)``.
-        term_reach: half of the ranges within which the terms of sums lie, ``(B, n - d - 1)``; these
-            begin at 0.
+            of the others, ``(J, 1 + k, n, B)``.
+        tips: constants of the cones, ``(J, 1 + k, B)``.
+        middle: middles of the bounds, ``(d, B)``.
+        half: half widths of the bounds, ``(d, B)``.
+        unit: mean half widths, ``(B,)``.
+        reach: largest values of the terms of sums, whose least ones are 0, ``(n - d - 1, B)``.
     """
 
-    rows: Tensor
-    offsets: Tensor
-    loose: Tensor
-    cones: Tensor
-    tips: Tensor
-    middle: Tensor
-    half: Tensor
-    unit: Tensor
-    term_reach: Tensor
+    rows: Array
+    offsets: Array
+    loose: Array
+    cones: Array
+    tips: Array
+    middle: Array
+    half: Array
+    unit: Array
+    reach: Array
 
     @classmethod
     def stack(cls, parts: Sequence[Superlevel], bounds: Box) -> Self:
         """Stack descriptions, each with batch shape ``(B,)``: kinked sums, rows and cones.
 
         Args:
-            parts: descriptions, one for each set, at least one of them with rows.
+            parts: descriptions in float64, one for each set.
             bounds: finite bounds of the actions, ``(B, d)``.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
         sums = [part for part in parts if isinstance(part, KinkedSum)]
         batch, dim = bounds.low.shape
-        middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
-        unit = half.mean(-1, keepdim=True)
-        width, terms = dim + 1 + len(sums) * dim, len(sums) * dim
-        stacked = middle.new_zeros(batch, 2 * terms + len(sums), width)
-        offsets = torch.zeros_like(stacked[..., 0])
-        reaches = [middle.new_zeros(batch, 0)]
-        for i, part in enumerate(sums):
-            rate = (part.rate.masked_fill(part.rate == 0, 1) * unit.squeeze(-1)).unsqueeze(-1)
-            own = slice(dim + 1 + i * dim, dim + 1 + (i + 1) * dim)
-            for j, slope in enumerate((part.upper / rate, part.lower / rate)):
-                first = j * terms + i * dim
-                stacked[:, first : first + dim, :dim] = torch.diag_embed(slope * half)
-                stacked[:, first : first + dim, own] = -torch.eye(dim).to(middle)
-                offsets[:, first : first + dim] = -slope * middle
-            stacked[:, 2 * terms + i, own] = 1
-            size = (part.size.unsqueeze(-1) / rate).squeeze(-1)
-            offsets[:, 2 * terms + i] = torch.where(part.rate > 0, size, torch.inf)
-            steepest = torch.maximum(part.upper.abs(), part.lower.abs()) / rate
-            reaches.append(steepest * torch.maximum(bounds.low.abs(), bounds.high.abs()) / 2)
-        reach = torch.cat(reaches, -1)
-        loose = torch.ones_like(offsets)
-        loose[:, 2 * terms :] = 3 + 4 * reach.view(batch, len(sums), dim).sum(-1)
-        normals = torch.cat(
-            [(p.normals / p.rates.unsqueeze(-1)).expand(batch, -1, -1) for p in rows], 1
-        )
-        far = torch.cat([(p.offsets / p.rates).expand(batch, -1) for p in rows], 1)
-        far = (far - (normals @ middle.unsqueeze(-1)).squeeze(-1)) / unit
-        normals = normals * (half / unit).unsqueeze(-2)
-        height = max((part.matrix.shape[-2] for part in cones), default=0)
-        stacked_cones = middle.new_zeros(batch, len(cones), 1 + height, width)
-        tips = torch.zeros_like(stacked_cones[..., :1])
+        low, high = batch_last(bounds.low, batch, 1), batch_last(bounds.high, batch, 1)
+        middle, half = (low + high) / 2, (high - low) / 2
+        unit = half.mean(0)
+        terms = len(sums) * dim
+        width = dim + 1 + terms
+        reach = np.zeros((terms, batch))
+        many = sum(part.offsets.shape[-1] for part in rows)
+        first = 2 * terms + len(sums)
+        stacked, offsets = np.zeros((first + many, width, batch)), np.zeros((first + many, batch))
+        loose = np.ones_like(offsets)
+        each = np.arange(dim)
+        for i, total in enumerate(sums):
+            own = i * dim + each
+            rate = batch_last(total.rate, batch, 0) * unit
+            counts = rate > 0
+            rate = np.where(counts, rate, 1.0)
+            steepest = np.zeros((dim, batch))
+            for j, slope in enumerate((total.upper, total.lower)):
+                relative = batch_last(slope, batch, 1) / rate
+                stacked[j * terms + own, each] = relative * half
+                stacked[j * terms + own, dim + 1 + own] = -1
+                offsets[j * terms + own] = -relative * middle
+                steepest = np.maximum(steepest, np.abs(relative))
+            reach[own] = steepest * np.maximum(np.abs(low), np.abs(high))
+            stacked[2 * terms + i, dim + 1 + own] = 1
+            size = batch_last(total.size, batch, 0) / rate
+            offsets[2 * terms + i] = np.where(counts, size, np.inf)
+            loose[2 * terms + i] = 3 + 2 * reach[own].sum(0)
+        for part in rows:
+            last = first + part.offsets.shape[-1]
+            rates = batch_last(part.rates, batch, 1)
+            normals = batch_last(part.normals, batch, 2) / rates[:, None]
+            places = batch_last(part.offsets, batch, 1) / rates
+            offsets[first:last] = (places - times(normals, middle)) / unit
+            stacked[first:last, :dim] = normals * (half / unit)
+            first = last
+        height = 1 + max((part.matrix.shape[-2] for part in cones), default=0)
+        stacked_cones = np.zeros((len(cones), height, width, batch))
+        tips = np.zeros((len(cones), height, batch))
         for i, cone in enumerate(cones):
-            rate = cone.rate * unit.squeeze(-1)
-            matrix = cone.matrix / rate[..., None, None]
-            vector = cone.vector / rate.unsqueeze(-1) + (matrix @ middle.unsqueeze(-1)).squeeze(-1)
-            stacked_cones[:, i, 1 : 1 + matrix.shape[-2], :dim] = -matrix * half.unsqueeze(-2)
-            tips[:, i, 1 : 1 + matrix.shape[-2], 0] = vector
-            tips[:, i, 0, 0] = cone.size / rate
-        return cls(
-            rows=torch.cat([stacked, pad(normals, (0, 1 + terms))], 1),
-            offsets=torch.cat([offsets, far], 1).unsqueeze(-1),
-            loose=torch.cat([loose, torch.ones_like(far)], 1).unsqueeze(-1),
-            cones=stacked_cones,
-            tips=tips,
-            middle=middle,
-            half=half,
-            unit=unit,
-            term_reach=reach,
-        )
+            rate = batch_last(cone.rate, batch, 0) * unit
+            matrix = batch_last(cone.matrix, batch, 2) / rate
+            last = 1 + len(matrix)
+            stacked_cones[i, 1:last, :dim] = -matrix * half
+            tips[i, 1:last] = batch_last(cone.vector, batch, 1) / rate + times(matrix, middle)
+            tips[i, 0] = batch_last(cone.size, batch, 0) / rate
+        return cls(stacked, offsets, loose, stacked_cones, tips, middle, half, unit, reach)
 
-    def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
+    def requiring(self, required: Array, trial: Flags, counts: Flags) -> Self:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
-            required: slacks ``(B, R)`` required of all sums, rows and cones, in this order.
-            trial: flags of those that exceed it by t, boolean; the others need no more than it.
-            counts: flags of those that count at all, boolean.
+            required: slacks ``(R, B)`` required of all sums, rows and cones, in this order.
+            trial: flags of those that exceed it by t, ``(R, B)``; the others need no more than it.
+            counts: flags of those that count at all, ``(R, B)``.
         """
-        first, dim = self.terms, self.dim
-        sizes = [self.rows.shape[1] - first, self.cones.shape[1]]
-        needs, tried, on = (
-            flags.unsqueeze(-1).split(sizes, 1) for flags in (required / self.unit, trial, counts)
-        )
-        offsets, loose = self.offsets[:, first:], self.loose[:, first:]
-        row_on, cone_on = on[0] & offsets.isfinite(), on[1].unsqueeze(-1)
-        kept = row_on.clone()
+        first, dim, needs = len(self.reach) * 2, self.dim, required / self.unit
+        split = len(self.rows) - first
+        on, cone_on = counts[:split] & np.isfinite(self.offsets[first:]), counts[split:]
+        rows, offsets = self.rows.copy(), self.offsets.copy()
         # Sums keep the terms, which nothing else bounds.
-        kept[:, : first // (2 * dim)] = True
-        rows = torch.cat([self.rows[:, :first], self.rows[:, first:] * kept], 1)
-        rows[:, first:, dim] = (tried[0] & row_on).squeeze(-1).to(rows)
-        cones = self.cones * cone_on
-        cones[:, :, 0, dim] = (tried[1] & on[1]).squeeze(-1).to(cones)
-        tips = self.tips.masked_fill(~cone_on, 0)
-        tips[:, :, 0] = torch.where(on[1], self.tips[:, :, 0] - needs[1], 1)
-        offsets = torch.where(row_on, offsets - needs[0], loose)
-        return replace(
-            self,
-            rows=rows,
-            offsets=torch.cat([self.offsets[:, :first], offsets], 1),
-            cones=cones,
-            tips=tips,
-        )
+        sums = first // (2 * dim)
+        rows[first + sums :] *= on[sums:, None]
+        rows[first:, dim] = trial[:split] & on
+        offsets[first:] = np.where(on, offsets[first:] - needs[:split], self.loose[first:])
+        cones, tips = self.cones * cone_on[:, None, None], self.tips * cone_on[:, None]
+        cones[:, 0, dim] = trial[split:] & cone_on
+        tips[:, 0] = np.where(cone_on, tips[:, 0] - needs[split:], 1.0)
+        return replace(self, rows=rows, offsets=offsets, cones=cones, tips=tips)
 
     @property
     def dim(self) -> int:
         """The dimension d of the actions."""
-        return self.middle.shape[-1]
+        return len(self.middle)
 
-    @property
-    def terms(self) -> int:
-        """The number of rows that bound the terms of sums."""
-        return 2 * self.term_reach.shape[-1]
-
-    def select(self, keep: Tensor) -> Self:
+    def select(self, keep: Flags | Index) -> Self:
         """Return some of the B problems."""
-        return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        return type(self)(**{f.name: getattr(self, f.name)[..., keep] for f in fields(self)})
 
-    def with_rows(self, normals: Tensor, offsets: Tensor, trial: Tensor, counts: Tensor) -> Self:
+    def with_rows(self, normals: Array, offsets: Array, trial: Flags, counts: Flags) -> Self:
         """Return the problems with rows added, where they count.
 
         Args:
-            normals: normals of the rows, ``(B, m, d)``, of slacks that are no further divided.
-            offsets: offsets of the rows, ``(B, m)``.
-            trial: flags of the rows on trial, boolean ``(B, m)``.
-            counts: flags of the rows that count, boolean ``(B, m)``.
+            normals: normals of the rows, ``(m, d, B)``, of slacks that are not divided further.
+            offsets: offsets of the rows, ``(m, B)``.
+            trial: flags of the rows on trial, ``(m, B)``.
+            counts: flags of the rows that count, ``(m, B)``.
         """
-        offsets = (offsets - (normals @ self.middle.unsqueeze(-1)).squeeze(-1)) / self.unit
-        rows = pad(normals * (self.half / self.unit).unsqueeze(-2), (0, 1 + self.terms // 2))
-        rows[..., self.dim] = trial.to(rows)
-        rows = rows * counts.unsqueeze(-1)
-        offsets = torch.where(counts, offsets, 1.0).unsqueeze(-1)
+        rows = np.zeros((len(normals), *self.rows.shape[1:]))
+        rows[:, : self.dim] = normals * (self.half / self.unit) * counts[:, None]
+        rows[:, self.dim] = trial & counts
+        offsets = np.where(counts, (offsets - times(normals, self.middle)) / self.unit, 1.0)
         return replace(
             self,
-            rows=torch.cat([self.rows, rows], 1),
-            offsets=torch.cat([self.offsets, offsets], 1),
-            loose=torch.cat([self.loose, torch.ones_like(offsets)], 1),
+            rows=np.concatenate([self.rows, rows]),
+            offsets=np.concatenate([self.offsets, offsets]),
+            loose=np.concatenate([self.loose, np.ones_like(offsets)]),
         )
 
-    def at(self, action: Tensor) -> Tensor:
-        """Return x ``(B, n, 1)`` at an action, with a slack of 0 and exact terms of all sums."""
-        dim, first = self.dim, self.terms
-        place = ((action - self.middle) / self.half).unsqueeze(-1)
-        x = pad(place, (0, 0, 0, self.rows.shape[-1] - dim))
-        if first:
-            rooms = self.offsets[:, :first] - self.rows[:, :first] @ x
-            x[:, dim + 1 :] = torch.maximum(*(-rooms).chunk(2, 1))
+    def at(self, action: Array) -> Array:
+        """Return x ``(n, B)`` at actions ``(B, d)``, with a slack of 0 and exact terms of sums."""
+        x = np.zeros(self.rows.shape[1:])
+        x[: self.dim] = (action.T - self.middle) / self.half
+        if terms := len(self.reach):
+            rooms = self.offsets[: 2 * terms] - times(self.rows[: 2 * terms], x)
+            x[self.dim + 1 :] = np.maximum(-rooms[:terms], -rooms[terms:])
         return x
 
-    def action(self, x: Tensor) -> Tensor:
+    def action(self, x: Array) -> Array:
         """Return the actions ``(B, d)`` of unknowns."""
-        return torch.addcmul(self.middle, self.half, x[:, : self.dim, 0])
+        return np.ascontiguousarray((self.middle + self.half * x[: self.dim]).T)
 
-    def start(self, action: Tensor) -> Tensor:
+    def start(self, action: Array) -> Array:
         """Return x strictly inside at an action, its slack a mean half width below the possible."""
         x = self.at(action)
-        x[:, self.dim] = (self.slack_of(x) - 1).unsqueeze(-1)
-        if self.terms:
-            first, count = self.terms, self.terms // (2 * self.dim)
-            sums = slice(first, first + count)
-            room = self.offsets[:, sums] - self.rows[:, sums] @ x
-            x[:, self.dim + 1 :] += (room / (2 * self.dim)).repeat_interleave(self.dim, 1)
+        x[self.dim] = self.slack_of(x) - 1
+        if terms := len(self.reach):
+            sums = slice(2 * terms, 2 * terms + terms // self.dim)
+            room = self.offsets[sums] - times(self.rows[sums], x)
+            x[self.dim + 1 :] += np.repeat(room / (2 * self.dim), self.dim, 0)
         return x
 
-    def slack(self, action: Tensor) -> Tensor:
+    def rooms(self, x: Array) -> Array:
+        """Return by how much sums, rows and cones hold, ``(R, B)``."""
+        first = 2 * len(self.reach)
+        rooms = self.offsets[first:] - times(self.rows[first:], x)
+        if not len(self.cones):
+            return rooms
+        height = self.tips - times(self.cones, x)
+        return np.concatenate([rooms, height[:, 0] - length(height[:, 1:])])
+
+    def slack(self, action: Array) -> Array:
         """Return the smallest slack at an action of what is on trial, ``(B,)``."""
-        return self.slack_of(self.at(action)) * self.unit.squeeze(-1)
+        return self.slack_of(self.at(action)) * self.unit
 
-    def slack_of(self, x: Tensor) -> Tensor:
+    def slack_of(self, x: Array) -> Array:
         """Return the largest t at the actions and terms of x, ``(B,)``, in units."""
-        rooms = self.offsets - self.rows @ x
-        least = _of_trial(rooms, self.rows[:, :, self.dim]).amin((1, 2))
-        if self.cones.shape[1]:
-            heights = self.tips - self.cones @ x.unsqueeze(1)
-            rooms = heights[:, :, 0] - vector_norm(heights[:, :, 1:], dim=2)
-            least = torch.minimum(
-                least, _of_trial(rooms, self.cones[:, :, 0, self.dim]).amin((1, 2))
-            )
-        return least + x[:, self.dim, 0]
+        return x[self.dim] + np.where(self.rates() > 0, self.rooms(x), np.inf).min(0)
 
-    def bound(self) -> Tensor:
-        """Return upper bounds of what each of the slacks can be within the bounds, ``(B,)``."""
-        dim = self.dim
-        rooms = self.offsets + self.rows[..., :dim].abs().sum(-1, keepdim=True)
-        least = _of_trial(rooms, self.rows[:, :, dim]).amin((1, 2))
-        if self.cones.shape[1]:
-            reach = vector_norm(self.cones[:, :, 1:, :dim], dim=2).sum(-1, keepdim=True)
-            near = (vector_norm(self.tips[:, :, 1:], dim=2) - reach).relu()
-            rooms = _of_trial(self.tips[:, :, 0] - near, self.cones[:, :, 0, dim])
-            least = torch.minimum(least, rooms.amin((1, 2)))
-        return least
+    def rates(self) -> Array:
+        """Return 1 for the sums, rows and cones on trial, ``(R, B)``."""
+        rows = self.rows[2 * len(self.reach) :, self.dim]
+        return np.concatenate([rows, self.cones[:, 0, self.dim]])
+
+    def bound(self) -> Array:
+        """Return upper bounds of the smallest slack, from each slack's own range, ``(B,)``."""
+        dim, first = self.dim, 2 * len(self.reach)
+        most = self.offsets[first:] + np.abs(self.rows[first:, :dim]).sum(1)
+        reach = length(self.cones[:, 1:, :dim]).sum(1)
+        nearest = np.maximum(length(self.tips[:, 1:]) - reach, 0)
+        most = np.concatenate([most, self.tips[:, 0] - nearest])
+        return np.where(self.rates() > 0, most, np.inf).min(0)
 
 
-def _of_trial(rooms: Tensor, rates: Tensor) -> Tensor:
-    """Return rooms ``(B, M, 1)``, infinite where the rate of t is 0."""
-    return rooms.masked_fill((rates == 0).unsqueeze(-1), torch.inf)
+def batch_last(value: Tensor, batch: int, events: int) -> Array:
+    """Return values ``(*B, *event)`` as ``(*event, B)``."""
+    array = value.detach().cpu().numpy()
+    event = array.shape[array.ndim - events :]
+    return np.ascontiguousarray(np.moveaxis(np.broadcast_to(array, (batch, *event)), 0, -1))
+
+
+def times(matrix: Array, x: Array) -> Array:
+    """Return the product of matrices ``(..., m, n, B)`` with vectors ``(n, B)``."""
+    return np.asarray(np.einsum("...ib,ib->...b", matrix, x), dtype=np.float64)
+
+
+def length(vector: Array) -> Array:
+    """Return the norms ``(J, ..., B)`` of vectors ``(J, k, ..., B)``."""
+    return np.asarray(np.sqrt(np.square(vector).sum(1)), dtype=np.float64)
