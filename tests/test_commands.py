@@ -102,3 +102,14 @@ def test_wrong_input_is_explained(
     assert done.returncode != 0
     assert message in done.stderr
     assert not list(tmp_path.rglob("checkpoint.pt"))
+
+
+def test_a_refused_training_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("kept")
+    for folder in ("new", "mine"):
+        done = run(tmp_path, "cnfp-train", *TINY, f"hydra.run.dir={folder}", "optim.lr=-1")
+        assert done.returncode == 1
+        assert "optim.lr: expected a finite number > 0" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]

@@ -101,7 +101,7 @@ def draw_samples(
     states, bounds = lookahead.states, head.bounds
     bijector = head.get_bijector(states)
     latents = draw_latents(actions, len(states), bounds.dim).to(bounds.low)
-    sampled, _ = bijector.forward_and_log_det(latents)
+    sampled = bijector(latents)  # not with its log-determinant, which projections have none of
     uniform = bounds.low + (bounds.high - bounds.low) * torch.rand_like(latents)
     drawn = torch.cat([sampled, uniform])
     outcome = lookahead.outcome(drawn)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cnfp_torchrl.envs import StateSetter
 from cnfp_torchrl.keys import COST_KEY
+
+_NO_END = 1e30
 
 LARGEST_ENTRY = 64
 """Entries of a state with more numbers, such as pictures, are not written down."""
@@ -33,11 +37,31 @@ def uniform_states(env: EnvBase, state_setter: StateSetter, count: int) -> Tenso
     """Draw states ``(count,)`` from the observation spec, as the environment then shows them."""
     found: list[TensorDictBase] = []
     while sum(map(len, found)) < count:
-        shown = state_setter(bare(env), bare(env).observation_spec.rand())
+        shown = state_setter(bare(env), _drawn(bare(env).observation_spec))
         if isinstance(env, TransformedEnv):
             shown = env.transform._reset(shown.empty(), shown)
         found.append(shown.reshape(-1))
     return torch.cat(found)[:count]
+
+
+def _drawn(spec: Composite) -> TensorDictBase:
+    """Draw states, uniformly between two ends; TorchRL draws NaN where a component has one end."""
+    states: TensorDictBase = spec.rand()
+    for key in spec.keys(include_nested=True, leaves_only=True):
+        if isinstance(spec[key], Bounded) and spec[key].dtype.is_floating_point:
+            states.set(key, _between(spec[key].space.low, spec[key].space.high))
+    return states
+
+
+def _between(low: Tensor, high: Tensor) -> Tensor:
+    """Draw uniformly where both ends are finite, else normally around 0 or from the one end."""
+    noise = torch.randn_like(low)
+    # Some specs write the largest number for no end at all.
+    has_low, has_high = (end.abs() < _NO_END for end in (low, high))
+    share = torch.rand_like(low)
+    inner = torch.where(has_low, low, 0) * (1 - share) + torch.where(has_high, high, 0) * share
+    one_end = torch.where(has_low, low + noise.abs(), high - noise.abs())
+    return torch.where(has_low & has_high, inner, torch.where(has_low | has_high, one_end, noise))
 
 
 def difference(env: EnvBase, expected: TensorDictBase, given: TensorDictBase) -> NestedKey | None:

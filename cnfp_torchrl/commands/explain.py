@@ -16,7 +16,7 @@ with needs_extra("train"):
     from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
     from cnfp_torchrl.modules import flow_head
     from cnfp_torchrl.training.agent import build_environment, load_actor
-    from cnfp_torchrl.training.callbacks import replay_episodes
+    from cnfp_torchrl.training.episodes import record_episode
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.settings import EvaluationSettings
     from cnfp_torchrl.visual.explanation import explain
@@ -62,14 +62,14 @@ def explain_run(
         )
     if step < 0:
         raise ValueError(f"--step: expected a number >= 0, given {step}")
-    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
+    env = build_environment(config, batch_size=[1], with_anchor=True)
     actor = load_actor(folder, config, env)
     if not flow_head(actor).flow.has_density:
         raise ValueError(
             f"{folder.path}: expected a flow with stages, such as flow=exact, given "
             f"{type(flow_head(actor).flow).__name__}, which has none to explain"
         )
-    (steps,) = replay_episodes(env, actor, settings, [episode], deterministic)
+    steps = record_episode(env, actor, settings, episode, deterministic=deterministic)
     if step >= len(steps):
         raise ValueError(
             f"--step: expected a number from 0 to {len(steps) - 1}, the last of episode {episode}, "

@@ -20,5 +20,6 @@ def needs_extra(name: str) -> Iterator[None]:
         if str(error.name).startswith(__package__.partition(".")[0]):
             raise
         sys.exit(
-            f"{error.name} is not installed; install it with: pip install 'cnfp_torchrl[{name}]'"
+            f"this command needs the extra {name!r}: pip install 'cnfp_torchrl[{name}]' "
+            f"({error.name} is not installed)"
         )

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.record.loggers import Logger
 
-from cnfp_torchrl.modules import guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.evaluation import evaluate_seeded
+from cnfp_torchrl.training.episodes import record_episode
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 
@@ -23,7 +20,7 @@ RECORDING = "recording.rrd"
 
 
 class EpisodeCallback(Protocol):
-    """Called with episodes of an evaluation, one after another."""
+    """Called with episodes, one after another."""
 
     def on_episode(self, episode: Sequence[TensorDictBase]) -> None:
         """Take an episode: its transitions, each of batch size ``()``."""
@@ -35,7 +32,7 @@ class EpisodeCallback(Protocol):
 
 
 class TrainingCallback(EpisodeCallback, Protocol):
-    """Called with every batch of training, and then with episodes of the final evaluation."""
+    """Called with every batch of training, and then with episodes of the trained policy."""
 
     @property
     def loggers(self) -> Sequence[Logger]:
@@ -55,7 +52,7 @@ class CallbackFactory(Protocol):
     """Makes the callbacks of a run: what ``conf/visual/`` describes.
 
     Args:
-        episodes: number of episodes that callbacks get of an evaluation, its first ones.
+        episodes: number of episodes that callbacks get.
         deterministic: take them from the deterministic policy and not from the stochastic one.
     """
 
@@ -101,79 +98,36 @@ def show_episodes(
     *,
     trusted: tuple[str, ...] = (),
 ) -> EpisodeCallback:
-    """Give the first episodes of a run's evaluation to a callback, and return it, still open.
+    """Give episodes of a run's policy to a callback, and return it, still open.
 
     Args:
         folder: a finished run.
-        settings: those of the evaluation that the episodes are part of.
+        settings: those of `record_episode`.
         factory: the maker of the callback.
         recording: the file to record into.
         trusted: see `RunFolder.load_config`.
     """
     config = folder.load_config(trusted)
-    env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)
+    env = build_environment(config, batch_size=[1], with_anchor=True)
     actor = load_actor(folder, config, env)
     callback = factory.for_evaluation(recording, actor, env)
     try:
-        numbers = first_episodes(factory, settings)
-        for episode in replay_episodes(env, actor, settings, numbers, factory.deterministic):
-            callback.on_episode(episode)
+        give_episodes(callback, factory, settings, env, actor)
     except BaseException:
         callback.close()
         raise
     return callback
 
 
-def first_episodes(factory: CallbackFactory, settings: EvaluationSettings) -> range:
-    """Return the numbers of the episodes of an evaluation that callbacks get."""
-    return range(min(factory.episodes, settings.episodes))
-
-
-def replay_episodes(
+def give_episodes(
+    callback: EpisodeCallback,
+    factory: CallbackFactory,
+    settings: EvaluationSettings,
     env: EnvBase,
     actor: SafeProbabilisticTensorDictSequential,
-    settings: EvaluationSettings,
-    numbers: Iterable[int],
-    deterministic: bool,
-) -> list[list[TensorDictBase]]:
-    """Return the transitions of some episodes of an evaluation, each of batch size ``()``.
-
-    Args:
-        env: the environment, of the evaluation's batch size, with anchor and active flags.
-        actor: the trained actor.
-        settings: those of the evaluation.
-        numbers: the episodes' numbers, from 0.
-        deterministic: take the deterministic policy and not the stochastic one.
-    """
-    recorder = EpisodeRecorder(numbers)
-    evaluate_seeded(
-        env, guarded(actor, env), settings, deterministic=deterministic, on_step=recorder
-    )
-    return list(recorder.episodes.values())
-
-
-class EpisodeRecorder:
-    """Keeps the transitions of some episodes of an evaluation, as the `on_step` of `evaluate`.
-
-    Args:
-        numbers: the episodes' numbers, in the order in which `evaluate` counts them.
-    """
-
-    def __init__(self, numbers: Iterable[int]) -> None:
-        self.episodes: dict[int, list[TensorDictBase]] = {number: [] for number in numbers}
-        self._running: Tensor | None = None
-        self._first = 0
-
-    def __call__(self, transition: TensorDictBase) -> None:
-        """Keep a transition of any batch size, where it is of one of the episodes."""
-        batch = transition.reshape(-1)
-        if self._running is None:
-            self._running = torch.ones(len(batch), dtype=torch.bool)
-        for number, steps in self.episodes.items():
-            index = number - self._first
-            if 0 <= index < len(batch) and self._running[index]:
-                steps.append(batch[index].clone())
-        self._running = self._running & ~batch.get(("next", "done")).reshape(-1).cpu()
-        if not bool(self._running.any()):
-            self._first += len(batch)
-            self._running = None
+) -> None:
+    """Record as many episodes as a callback's maker asks for, and give them to the callback."""
+    for number in range(factory.episodes):
+        callback.on_episode(
+            record_episode(env, actor, settings, number, deterministic=factory.deterministic)
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from difflib import get_close_matches
 from typing import Any, Self
 
 import torch
@@ -102,12 +103,24 @@ class ConstraintTally:
 
     @classmethod
     def of(cls, env: EnvBase) -> Self:
-        """Return the tally of an environment; warns of constraints that nothing judges."""
+        """Return the tally of an environment; warns of constraints that nothing judges.
+
+        Raises:
+            ValueError: when one has no judge but there is a judge of nearly its name.
+        """
         judged = counted_constraints(env)
         geometry = env.observation_spec.get(CONSTRAINTS_KEY, None)
         entries = geometry.items() if isinstance(geometry, Composite) else ()
         specs = {name: spec for name, spec in entries if name not in RESERVED_NAMES}
-        if missed := [name for name in specs if name not in judged]:
+        others = [name for name in judged if name not in specs]
+        missed = [name for name in specs if name not in judged]
+        for name in missed:
+            if alike := get_close_matches(name, others, n=1):
+                raise ValueError(
+                    f"constraint {name!r}: expected a judge of the same name in the environment, "
+                    f"given one named {alike[0]!r}; give geometry and judge one name"
+                )
+        if missed:
             given = f"cost has columns for {list(judged)}" if judged else "it has no cost"
             warnings.warn(
                 f"constraints {missed}: expected a judge of the same name in the environment, but "
@@ -222,7 +235,8 @@ def gave_way_text(report: Mapping[str, Any]) -> str:
     phrases = []
     for state in CONSTRAINT_STATES[1:]:
         if count := steps[state]:
-            amount = f" by up to {report['largest_relaxation']:.3g}" if state == "relaxed" else ""
+            largest = f" by up to {report['largest_relaxation']:.3g} action units"
+            amount = largest if state == "relaxed" else ""
             phrases.append(f"{state}{amount} in {100 * count / total:.2g} % of steps")
     if phrases or any(broken.values()):
         counts = ", ".join(f"{count} while {state}" for state, count in broken.items())

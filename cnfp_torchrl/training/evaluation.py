@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from hydra.utils import instantiate
@@ -97,12 +98,14 @@ class Evaluation:
         constraints: counts of each constraint: those that are judged first, in the order of the
             costs.
         steps: number of steps of these episodes in all.
+        cut_off: number of episodes that would have gone on and were cut off.
     """
 
     returns: Tensor
     costs: Tensor
     constraints: Mapping[str, ConstraintCounts]
     steps: int
+    cut_off: int = 0
 
     @property
     def violations(self) -> dict[str, int | None]:
@@ -122,6 +125,7 @@ class Evaluation:
             "constraints": constraint_reports(self.constraints),
             "episodes": episodes,
             "steps": self.steps,
+            "cut_off": self.cut_off,
         }
 
 
@@ -131,21 +135,23 @@ def evaluate_seeded(
     settings: EvaluationSettings,
     *,
     deterministic: bool = False,
-    on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Run the episodes that a seed determines: starts, goals and what the policy draws.
 
     Args:
         env: see `evaluate`.
         policy: see `evaluate`.
-        settings: number of episodes and the seed.
+        settings: number of episodes, the seed, and the length at which episodes are cut off.
         deterministic: see `evaluate`.
-        on_step: see `evaluate`.
     """
     env.set_seed(settings.seed)
     torch.manual_seed(settings.seed)
     return evaluate(
-        env, policy, episodes=settings.episodes, deterministic=deterministic, on_step=on_step
+        env,
+        policy,
+        episodes=settings.episodes,
+        deterministic=deterministic,
+        max_steps=settings.max_steps,
     )
 
 
@@ -157,7 +163,6 @@ def evaluate(
     episodes: int,
     deterministic: bool = False,
     max_steps: int = 10_000,
-    on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Run a policy for whole episodes and count.
 
@@ -167,12 +172,10 @@ def evaluate(
         policy: any TorchRL policy.
         episodes: number of episodes.
         deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
-        max_steps: length beyond which an episode counts as endless.
-        on_step: function that gets every transition, of the environment's batch size.
+        max_steps: length at which an episode that goes on is cut off, which a warning tells.
 
     Raises:
         ValueError: when `episodes` is not positive.
-        RuntimeError: when an episode outlasts `max_steps`.
         FloatingPointError: when a return is not finite.
     """
     if episodes < 1:
@@ -180,19 +183,35 @@ def evaluate(
     tally = ConstraintTally.of(env)
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns = torch.zeros(0)
-    costs, steps = torch.zeros(0, len(tally.judged)), 0
+    costs, steps, cut_off = torch.zeros(0, len(tally.judged)), 0, 0
     with set_exploration_type(mode):
         while (missing := episodes - len(returns)) > 0:
-            batch = _run_batch(env, policy, tally, missing, max_steps, on_step)
-            returns = torch.cat([returns, batch[0]])
-            costs, steps = torch.cat([costs, batch[1]]), steps + batch[2]
+            batch = _run_batch(env, policy, tally, missing, max_steps)
+            returns = torch.cat([returns, batch.returns])
+            costs = torch.cat([costs, batch.costs])
+            steps, cut_off = steps + batch.steps, cut_off + batch.cut_off
+    if cut_off:
+        warnings.warn(
+            f"{cut_off} of {episodes} episodes went on after {max_steps} steps and were cut off "
+            "there (evaluation.max_steps)",
+            stacklevel=2,
+        )
     if not bool(returns.isfinite().all()):
         broken = int((~returns.isfinite()).sum())
         raise FloatingPointError(
             f"return: expected finite numbers, but those of {broken} of {episodes} episodes are "
             "not; look at the environment's reward and at the policy's parameters"
         )
-    return Evaluation(returns, costs, tally.counts(), steps)
+    return Evaluation(returns, costs, tally.counts(), steps, cut_off)
+
+
+class _Batch(NamedTuple):
+    """Returns ``(n,)``, costs ``(n, J)`` and numbers of some episodes, as in `Evaluation`."""
+
+    returns: Tensor
+    costs: Tensor
+    steps: int
+    cut_off: int
 
 
 def transitions(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
@@ -209,9 +228,8 @@ def _run_batch(
     tally: ConstraintTally,
     most: int,
     max_steps: int,
-    on_step: Callable[[TensorDictBase], None] | None,
-) -> tuple[Tensor, Tensor, int]:
-    """Run one episode of every agent; return those of the first ones, with costs and steps."""
+) -> _Batch:
+    """Run one episode of every agent, and return those of the first ones."""
     size = env.batch_size.numel()
     running = torch.ones(size, dtype=torch.bool, device=env.device)
     wanted = torch.arange(size, device=env.device) < most
@@ -219,8 +237,6 @@ def _run_batch(
     costs = torch.zeros(size, len(tally.judged), device=env.device)
     steps = 0
     for transition in islice(transitions(env, policy), max_steps):
-        if on_step is not None:
-            on_step(transition)
         outcome = transition.get("next")
         tally.add(transition, running & wanted)
         returns += running * outcome.get(REWARD_KEY).reshape(size)
@@ -228,12 +244,9 @@ def _run_batch(
             costs += running.unsqueeze(-1) * outcome.get(COST_KEY).reshape(costs.shape)
         steps += int((running & wanted).sum())
         running = running & ~outcome.get("done").reshape(size)
-        if not bool(running.any()):
-            return returns[:most].cpu(), costs[:most].cpu(), steps
-    raise RuntimeError(
-        f"max_steps: expected every episode to end within {max_steps} steps, but "
-        f"{int(running.sum())} of {size} go on; truncate the environment"
-    )
+        if not bool((running & wanted).any()):
+            break
+    return _Batch(returns[:most].cpu(), costs[:most].cpu(), steps, int((running & wanted).sum()))
 
 
 def evaluate_run(

@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cnfp_torchrl.audit import AuditReport, AuditSettings, ConstraintMetrics, Share, audit
+from cnfp_torchrl.audit.states import uniform_states
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, ConstraintSet, VisibleRegion
 from cnfp_torchrl.visual.figures.audit import audit_figure
@@ -408,3 +409,34 @@ def test_intervals_at_the_ends() -> None:
     one = Share.clustered(torch.tensor([3]), torch.tensor([4]))
     assert one.low < 0.75 < one.high
     assert one.high - one.low > 0.5
+
+
+def test_states_are_numbers_whatever_ends_the_spec_has() -> None:
+    class Partly(Disc):
+        """Ends on both sides, on either one, on none, and the largest numbers for none."""
+
+        def __init__(self) -> None:
+            super().__init__(64, cost=False)
+            largest = torch.finfo().max
+            low = torch.tensor([-2.0, -torch.inf, 1.0, -torch.inf, -largest])
+            high = torch.tensor([2.0, -1.0, torch.inf, torch.inf, largest])
+            spec = Bounded(low.expand(64, 5), high.expand(64, 5), (64, 5))
+            self.observation_spec = Composite({"observation": spec}, shape=[64])
+
+    drawn = uniform_states(Partly(), lambda _, states: states, 512)["observation"]
+    assert drawn.isfinite().all()
+    assert drawn[:, 0].abs().max() <= 2
+    assert drawn[:, 0].std() > 1
+    assert drawn[:, 1].max() <= -1
+    assert drawn[:, 2].min() >= 1
+    assert drawn[:, 3:].abs().max() < 10
+
+
+@pytest.mark.parametrize("flow", ["exact", "radial", "projection", "squash", "unconstrained"])
+def test_every_flow_is_audited(flow: str) -> None:
+    env = with_geometry(Disc(64), Share_(0.8))
+    settings = AuditSettings(states=16, actions=8, steps=2)
+    report = audit(env, flow=flow, state_setter=set_state, settings=settings)
+    assert bool(report.flaws) == (flow == "unconstrained")
+    titles = [axes.get_title() for axes in audit_figure(report).axes]
+    assert any("escaped" in title for title in titles) == (flow == "unconstrained")

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from cnfp_torchrl.commands.explain import explain_run, main
 from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.callbacks import replay_episodes
+from cnfp_torchrl.training.episodes import record_episode
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
@@ -49,15 +49,16 @@ def test_every_flow_is_explained(flow: str, make_run: Callable[..., RunFolder]) 
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_the_step_is_that_of_the_evaluation(
+def test_the_step_is_that_of_the_episode(
     deterministic: bool, make_run: Callable[..., RunFolder]
 ) -> None:
     folder = make_run("flow=exact")
     said = explain_run(folder, step=5, episode=2, seed=11, deterministic=deterministic)
     config = folder.load_config()
-    env = build_environment(config, batch_size=[3], with_anchor=True)
-    settings = EvaluationSettings(3, 11)
-    (steps,) = replay_episodes(env, load_actor(folder, config, env), settings, [2], deterministic)
+    env = build_environment(config, batch_size=[1], with_anchor=True)
+    actor = load_actor(folder, config, env)
+    settings = EvaluationSettings(seed=11)
+    steps = record_episode(env, actor, settings, 2, deterministic=deterministic)
     x, y, *_ = steps[5]["observation"].tolist()
     assert f"At ({x:.3f}, {y:.3f})" in said
     action = ", ".join(f"{value:.3f}" for value in steps[5]["action"].tolist())

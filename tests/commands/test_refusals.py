@@ -1,9 +1,11 @@
 """Refusals are told in their own words; what nobody foresaw keeps its traceback."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hydra.errors import CompactHydraException
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from cnfp_torchrl.commands.refusals import told_in_a_sentence
@@ -53,3 +55,35 @@ def test_what_nobody_foresaw_keeps_its_traceback(failed: Callable[[], object]) -
     with pytest.raises((ValueError, TypeError)) as caught, told_in_a_sentence():
         failed()
     assert not isinstance(caught.value, CompactHydraException)
+
+
+MODULES = {
+    "unparsed": "def make(:",
+    "lacking": "import no_such_package",
+    "failing": "def make():\n    return 1 / 0",
+    "refusing": "from cnfp_torchrl.geometry import Box\n\n\ndef make():\n    Box(1, 0)",
+}
+
+
+@pytest.mark.parametrize(
+    ("target", "cause"),
+    [
+        ("not_there_at_all.make", "no module 'not_there_at_all' is found.*PYTHONPATH"),
+        ("unparsed.make", r"SyntaxError.*unparsed\.py, line 1"),
+        ("lacking.make", r"No module named 'no_such_package' \(.*lacking\.py, line 1\)"),
+        ("failing.make", r"ZeroDivisionError.*failing\.py, line 2"),
+        ("failing.mak", "failing has no 'mak'; there is make"),
+        ("failing.deeper.make", "failing has no 'deeper'"),
+        ("refusing.make", "^Box, field 'low': expected"),
+    ],
+)
+def test_of_a_target_that_cannot_be_built_the_first_cause_is_told_in_one_line(
+    target: str, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, content in MODULES.items():
+        (tmp_path / f"{name}.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = OmegaConf.create({"env": {"base": {"_target_": target}}})
+    with pytest.raises(CompactHydraException, match=cause) as caught, told_in_a_sentence():
+        instantiate(config.env.base)
+    assert "\n" not in str(caught.value)

@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from cnfp_torchrl.configuration import config_directory, require_settings
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
@@ -24,7 +26,7 @@ REFUSED = {
     "loss.target_entropy": ("a finite number or 'auto'", ["abc", "null", "inf"]),
     "target.tau": ("a number in (0, 1]", ["0", "1.5", "abc", "nan"]),
     "optim.lr": ("a finite number > 0", ["0", "-1", "abc", "null", "nan", "inf"]),
-    "collector.total_frames": (COUNT, ["-3", "0", "abc", "null", "1.5", "1e5"]),
+    "collector.total_frames": (COUNT, ["-3", "0", "abc", "null", "1.5", "1.5e0"]),
     "collector.frames_per_batch": (COUNT, ["-3", "0", "abc", "null", "1.5"]),
     "replay_buffer.batch_size": (COUNT, ["-3", "0", "abc", "null", "1.5"]),
     "replay_buffer.storage.max_size": (COUNT, ["-3", "0", "abc", "null", "1.5"]),
@@ -108,3 +110,31 @@ def test_settings_of_other_libraries_own_options_are_left_to_them(
         "+env.base.max_steps=4",
     )
     assert train(config, RunFolder.create(tmp_path / "run"))["steps"] == 32
+
+
+@pytest.mark.parametrize(("given", "read"), [("1e4", 10_000), ("2.0", 2), ("24000", 24_000)])
+def test_a_whole_number_may_have_an_exponent(
+    given: str, read: int, make_config: Callable[..., DictConfig]
+) -> None:
+    config = make_config(f"collector.total_frames={given}")
+    require_settings(config)
+    assert config.collector.total_frames == read
+    assert isinstance(config.collector.total_frames, int)
+    assert isinstance(config.optim.lr, float)
+
+
+@pytest.mark.parametrize("given", ["1.5", "-1e3", "0.0", "nan"])
+def test_no_other_number_is_whole(given: str, make_config: Callable[..., DictConfig]) -> None:
+    with pytest.raises(ValueError, match=r"collector\.total_frames: expected a whole number >= 1"):
+        require_settings(make_config(f"collector.total_frames={given}"))
+
+
+def test_a_task_states_discount_and_target_entropy_unless_they_are_given() -> None:
+    def losses(*overrides: str) -> tuple[Any, Any]:
+        with initialize_config_dir(str(config_directory()), version_base="1.3"):
+            loss = compose("train", overrides=list(overrides)).loss
+        return loss.gamma, loss.target_entropy
+
+    assert losses() == (0.95, -4.0)
+    assert losses("loss.gamma=0.9", "loss.target_entropy=-1") == (0.9, -1)
+    assert losses("~env.gamma", "~env.target_entropy") == (0.99, "auto")

@@ -20,13 +20,11 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rerun.chunk import RrdReader
-from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from tensordict import TensorDictBase
 
-from cnfp_torchrl.modules import guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
-from cnfp_torchrl.training.callbacks import EpisodeRecorder, replay_episodes, show_episodes
-from cnfp_torchrl.training.evaluation import Evaluation, evaluate_seeded
+from cnfp_torchrl.training.callbacks import show_episodes
+from cnfp_torchrl.training.episodes import record_episode
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
@@ -91,39 +89,16 @@ def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run:
         assert steps_of(path, f"/metrics/{name}") == [160, 320, 400], name
 
 
-@pytest.fixture
-def evaluated(monkeypatch: pytest.MonkeyPatch) -> dict[bool, list[list[TensorDictBase]]]:
-    """The first two episodes of a training's evaluations, by whether they are deterministic."""
-    episodes = {}
-
-    def spied(*given: Any, deterministic: bool, on_step: Callable, **options: Any) -> Evaluation:
-        kept = EpisodeRecorder(range(2))
-
-        def look(transition: TensorDictBase) -> None:
-            kept(transition)
-            if on_step is not None:
-                on_step(transition)
-
-        result = evaluate_seeded(*given, deterministic=deterministic, on_step=look, **options)
-        episodes[deterministic] = list(kept.episodes.values())
-        return result
-
-    monkeypatch.setattr("cnfp_torchrl.training.train.evaluate_seeded", spied)
-    return episodes
-
-
 @pytest.mark.parametrize("flow", ["exact", "squash", "unconstrained"])
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_the_final_evaluation_follows_the_training(
-    deterministic: bool,
-    flow: str,
-    tiny_run: Run,
-    evaluated: dict[bool, list[list[TensorDictBase]]],
+def test_episodes_of_the_trained_policy_follow_the_training(
+    deterministic: bool, flow: str, tiny_run: Run
 ) -> None:
     chosen = ["visual.episodes=2", f"visual.deterministic={deterministic}", f"flow={flow}"]
     folder, _ = tiny_run(*FILE, *chosen)
     path = folder.path / "recording.rrd"
-    steps = [step for episode in evaluated[deterministic] for step in episode]
+    episodes = [episode_of(folder, number, deterministic) for number in (0, 1)]
+    steps = [step for episode in episodes for step in episode]
     behind = range(192, 192 + 24)
     assert len(steps) == len(behind)
     last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "unconstrained": "1\\ bounds"}[flow]
@@ -276,36 +251,33 @@ def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
     assert compare(folder, reference) == 0
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_replayed_episodes_are_those_of_the_evaluation(
-    deterministic: bool, tiny_run: Run, tmp_path: Path
-) -> None:
-    folder, _ = tiny_run()
+def episode_of(folder: RunFolder, number: int, deterministic: bool) -> list[TensorDictBase]:
     config = folder.load_config()
-    settings = EvaluationSettings(episodes=5, seed=7)
+    env = build_environment(config, batch_size=[1], with_anchor=True)
+    actor = load_actor(folder, config, env)
+    settings = instantiate(config.evaluation)
+    return record_episode(env, actor, settings, number, deterministic=deterministic)
 
-    def made() -> tuple[EnvBase, Any]:
-        env = build_environment(config, batch_size=[5], with_anchor=True)
-        return env, load_actor(folder, config, env)
 
-    env, actor = made()
-    expected = evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic).returns
-    episodes = replay_episodes(*made(), settings, [0, 3], deterministic)
-    for number, episode in zip((0, 3), episodes, strict=True):
-        assert len(episode) == 12
-        total = sum(float(step["next", "reward"]) for step in episode)
-        assert total == pytest.approx(float(expected[number]), rel=1e-5)
+def test_an_episode_depends_on_its_seed_alone(tiny_run: Run, tmp_path: Path) -> None:
+    folder, _ = tiny_run()
+    first, second, again = (episode_of(folder, number, False) for number in (0, 1, 0))
+    assert [len(first), len(second)] == [12, 12]
+    for step, same, other in zip(first, again, second, strict=True):
+        torch.testing.assert_close(step["action"], same["action"], rtol=0, atol=0)
+        assert (step["observation"] != other["observation"]).any()
 
     factory = instantiate({"_target_": "cnfp_torchrl.visual.rerun.RunStream", "episodes": 2})
     path = tmp_path / "recording.rrd"
-    show_episodes(folder, settings, factory, path).close()
+    show_episodes(folder, EvaluationSettings(episodes=2), factory, path).close()
     assert steps_of(path, "/explanation") == list(range(24))
     words = read(path, "/explanation", "TextDocument:text")[19].item()
     assert words.startswith("Evaluation, episode 1, step 7 of 12, stochastic policy: **")
 
 
-def test_episodes_of_an_environment_without_batch_follow_each_other() -> None:
-    kept = EpisodeRecorder([1])
-    for step, done in enumerate([False, True, False, False, True, True]):
-        kept(TensorDict({"step": step, "next": {"done": torch.tensor([done])}}, []))
-    assert [int(each["step"]) for each in kept.episodes[1]] == [2, 3, 4]
+def test_an_endless_episode_is_cut_off(tiny_run: Run) -> None:
+    folder, _ = tiny_run()
+    config = folder.load_config()
+    env = build_environment(config, batch_size=[2], with_anchor=True)
+    actor = load_actor(folder, config, env)
+    assert len(record_episode(env, actor, EvaluationSettings(max_steps=5))) == 5

@@ -59,7 +59,7 @@ def test_what_cannot_be_widened_is_dropped() -> None:
     # Of the wall's own unit.
     assert 2 < result.constraints["wall"].largest_relaxation < 2.01
     said = evaluation_table({"pushing": result.report(None)})
-    assert "pushing: wall relaxed by up to 2 in 50 % of steps" in said
+    assert "pushing: wall relaxed by up to 2 action units in 50 % of steps" in said
     assert "pushing: window dropped in 50 % of steps" in said
     assert f"violations: 0 while active, {half} while relaxed, 0 while dropped" in said
 
@@ -70,7 +70,7 @@ def test_nothing_is_said_of_what_holds() -> None:
     assert len(evaluation_table({"pushing": report}).splitlines()) == 2
 
 
-@pytest.mark.parametrize("judged", [(), ("wal",)], ids=["missing", "misnamed"])
+@pytest.mark.parametrize("judged", [(), ("collision",)], ids=["missing", "other"])
 def test_what_nothing_judges_is_not_counted(judged: Sequence[str]) -> None:
     env = walls(Walls(judged=judged))
     with pytest.warns(UncountedConstraintWarning, match=r"\['wall'\].*not counted"):
@@ -122,3 +122,8 @@ def test_the_log_has_shares_and_amounts_since_the_last_entry(tmp_path: Path) -> 
     wall = metrics.counts()["wall"]
     assert wall.steps == {"active": 60, "relaxed": 20, "dropped": 0}
     assert wall.violations_while == {"active": 30, "relaxed": 20, "dropped": 0}
+
+
+def test_a_judge_of_nearly_the_name_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"constraint 'wall': .* given one named 'walls'"):
+        ConstraintTally.of(walls(Walls(judged=["walls"])))

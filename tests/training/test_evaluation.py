@@ -67,9 +67,11 @@ def test_returns_that_are_not_finite_are_told(monkeypatch: pytest.MonkeyPatch) -
         evaluate(PointNavEnv((3,), seed=0, max_steps=5), STILL, episodes=3)
 
 
-def test_an_endless_episode_is_named() -> None:
-    with pytest.raises(RuntimeError, match="truncate the environment"):
-        evaluate(PointNavEnv((2,), seed=0), STILL, episodes=2, max_steps=10)
+def test_endless_episodes_are_cut_off_and_told() -> None:
+    with pytest.warns(UserWarning, match="3 of 3 episodes went on after 10 steps"):
+        result = evaluate(PointNavEnv((2,), seed=0), STILL, episodes=3, max_steps=10)
+    assert (result.cut_off, result.steps) == (3, 30)
+    assert result.report(None)["cut_off"] == 3
 
 
 def test_score_is_the_line_of_the_method() -> None:

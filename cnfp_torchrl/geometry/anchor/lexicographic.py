@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.attempts import (
+    Attempt,
     first_attempt,
     no_attempt,
     refined_attempt,
@@ -47,7 +48,41 @@ is left.
 """
 
 
+class Begun(NamedTuple):
+    """The rule after its cheapest attempts, which decide many states.
+
+    Attributes:
+        sets: sets in order of application.
+        depths: depths of their rows.
+        attempt: points, and whether they are anchors.
+    """
+
+    sets: Sequence[ConstraintSet]
+    depths: list[Tensor]
+    attempt: Attempt
+
+    def all_held(self) -> Anchored:
+        """Return the anchors of states that are all decided: all sets hold."""
+        shape, anchor = self.attempt.decided.shape, self.attempt.anchor
+        active = torch.ones(*shape, len(self.sets), dtype=torch.bool, device=anchor.device)
+        amounts = tuple(depth.new_zeros(*shape, depth.shape[-1]) for depth in self.depths)
+        return Anchored(anchor, active, amounts)
+
+
 @torch.no_grad()
+def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Begun:
+    """Make the attempts that take the least time, and read no tensor on the host.
+
+    Args:
+        sets: sets in order of application, as in `lexicographic_anchor`.
+        candidate: points that may lie in all sets, ``(*batch, d)``.
+    """
+    depths = row_depths(sets)
+    if candidate is None and all(map(_is_described, sets)):
+        return Begun(sets, depths, no_attempt(sets))
+    return Begun(sets, depths, first_attempt(sets, depths, candidate))
+
+
 def lexicographic_anchor(
     sets: Sequence[ConstraintSet], candidate: Tensor | None = None, leeway: float = LEEWAY
 ) -> Anchored:
@@ -73,18 +108,25 @@ def lexicographic_anchor(
         GeometryError: when ``sets[0]`` is no box; where a search is needed, also when it is
             unbounded or a field has NaN in it.
     """
+    return finish_anchor(begin_anchor(sets, candidate), leeway)
+
+
+@torch.no_grad()
+def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
+    """Take steps inwards and search in the states that are not decided yet.
+
+    Args:
+        begun: what `begin_anchor` returned.
+        leeway: leeway, as in `lexicographic_anchor`.
+    """
     if not leeway > 0:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
+    sets, depths, found = begun
     bounds = bounds_of(sets)
-    depths = row_depths(sets)
-    if candidate is None and all(map(_is_described, sets)):
-        found = no_attempt(sets)
-    else:
-        found = first_attempt(sets, depths, candidate)
-    shape, found = found.decided.shape, found.select()
+    shape = found.decided.shape
+    _, active, relaxation = begun.all_held()
+    found = found.select()
     anchor = found.anchor
-    active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
-    relaxation = [depth.new_zeros(*shape, depth.shape[-1]) for depth in depths]
     left = (~found.decided).nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
@@ -110,7 +152,7 @@ def lexicographic_anchor(
         for amount, found_amount in zip(relaxation, searched.relaxation, strict=True):
             flat = amount.view(-1, amount.shape[-1])
             flat.index_copy_(0, left, (up * found_amount).to(amount))
-    return Anchored(anchor.view(*shape, anchor.shape[-1]), active, tuple(relaxation))
+    return Anchored(anchor.view(*shape, anchor.shape[-1]), active, relaxation)
 
 
 def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -36,6 +36,13 @@ _MARKS: dict[str, dict[str, Any]] = {
     "violates, in the set": {"marker": "X", "color": _FLAW, "markersize": 6, "mew": 0},
 }
 
+
+class _Bar(TypedDict):
+    height: float
+    color: str
+    faint: bool
+
+
 _MOST_SCENES = 4
 _MOST_FLAWS = 6
 
@@ -43,9 +50,10 @@ _MOST_FLAWS = 6
 def audit_figure(report: AuditReport) -> Figure:
     """Draw an audit.
 
-    The upper row holds the numbers by constraint; bars come from each source of states. The lower
-    row, for actions in the plane, shows for each constraint the state that speaks most against its
-    set: every action tried there.
+    The upper row holds the numbers by constraint; bars come from each source of states, and kinds
+    of flaws that were not found have no panel. The lower row lists the flaws and shows, for actions
+    in the plane and for each constraint, the state that speaks most against its set: every action
+    tried there.
 
     Args:
         report: of `cnfp_torchrl.audit.audit`.
@@ -53,11 +61,12 @@ def audit_figure(report: AuditReport) -> Figure:
     colors = constraint_colors(report.order) | {TOGETHER: INK}
     scenes = [scene for scene in report.worst_states if scene.actions.shape[-1] == 2][:_MOST_SCENES]
     with house_style():
-        figure = new_figure(13.0, 7.4 if scenes else 3.4)
+        has_lower = bool(scenes or report.flaws)
+        figure = new_figure(13.0, 7.4 if has_lower else 3.4)
         verdict = f"{len(report.flaws)} flaws" if report.flaws else "no flaw found"
         figure.suptitle(f"Audit of {report.subject['environment']}: {verdict}")
-        upper, *lower = figure.subfigures(2 if scenes else 1, 1, squeeze=False)[:, 0]
-        _draw_numbers(upper.subplots(1, 4), report, colors)
+        upper, *lower = figure.subfigures(1 + has_lower, 1, squeeze=False)[:, 0]
+        _draw_numbers(upper, report, colors)
         upper.legend(
             handles=_source_entries(list(report.sources)), loc="outside lower center", ncols=2
         )
@@ -65,7 +74,7 @@ def audit_figure(report: AuditReport) -> Figure:
             *panels, remarks = part.subplots(1, len(scenes) + 1, squeeze=False)[0]
             for axes, scene in zip(panels, scenes, strict=True):
                 _draw_scene(axes, scene, report.order, colors)
-            _write_remarks(remarks, report)
+            _write_remarks(remarks, report, has_scenes=bool(scenes))
     return figure
 
 
@@ -74,15 +83,33 @@ def save_audit(report: AuditReport, path: Path) -> Path:
     return save_png(audit_figure(report), path)
 
 
-def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[str, str]) -> None:
+_Shares = dict[str, Callable[[ConstraintMetrics], Share | None]]
+
+_FLAWS: _Shares = {
+    "unsound\n% of actions in the set": lambda x: x.unsound,
+    "escaped\n% of the flow's samples": lambda x: x.escaped,
+    "dead ends\n% of allowed actions": lambda x: x.dead_ends,
+}
+_FINDINGS: _Shares = {
+    "coverage\n% of what the indicators allow": lambda x: x.coverage,
+    "relaxed or dropped\n% of states": lambda x: x.gave_way,
+}
+_TIGHTNESS = "tightness\n% of the action bounds left open"
+_LED_INTO = "led into a violation\nsteps of the policy"
+
+
+def _draw_numbers(part: SubFigure, report: AuditReport, colors: Mapping[str, str]) -> None:
+    found = [each for findings in report.sources.values() for each in findings]
+    flaws = {
+        title: share_of
+        for i, (title, share_of) in enumerate(_FLAWS.items())
+        if i == 0 or any((share := share_of(each)) is not None and share.count for each in found)
+    }
+    led_into = {name: count for name, count in report.executed.led_into.items() if count}
+    titles = [*flaws, *([_LED_INTO] if led_into else []), *_FINDINGS, _TIGHTNESS]
+    panels = dict(zip(titles, part.subplots(1, len(titles), squeeze=False)[0], strict=True))
     names = [*report.order, TOGETHER]
-    titles = (
-        "unsound\n% of actions in the set",
-        "coverage\n% of what the indicators allow",
-        "relaxed or dropped\n% of states",
-        "tightness\n% of the action bounds left open",
-    )
-    for axes, title in zip(panels, titles, strict=True):
+    for title, axes in panels.items():
         axes.set_title(title)
         axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(names) - 0.5, -0.5)
@@ -93,26 +120,18 @@ def _draw_numbers(panels: Sequence[Axes], report: AuditReport, colors: Mapping[s
     for i, findings in enumerate(report.sources.values()):
         for each in findings:
             at = names.index(each.name) + (i - (len(report.sources) - 1) / 2) * height
-            _draw_findings(panels, each, at, 0.85 * height, colors[each.name], faint=i > 0)
-    for axes in panels[1:]:
-        axes.set_xlim(0, 104)
-    # Room for the counts beside the bars.
-    panels[0].set_xlim(0, max(1.0, 1.4 * panels[0].get_xlim()[1]))
-
-
-def _draw_findings(
-    panels: Sequence[Axes],
-    found: ConstraintMetrics,
-    at: float,
-    height: float,
-    color: str,
-    *,
-    faint: bool,
-) -> None:
-    shares = (found.unsound, found.coverage, found.gave_way)
-    for axes, share in zip(panels, shares, strict=False):
-        _draw_share(axes, share, at, height, color, faint=faint, told=axes is panels[0])
-    _draw_spread(panels[3], found.volume, at, height, color, faint=faint)
+            style: _Bar = {"height": 0.85 * height, "color": colors[each.name], "faint": i > 0}
+            for title, share_of in (flaws | _FINDINGS).items():
+                _draw_share(panels[title], share_of(each), at, counted=title in flaws, **style)
+            _draw_spread(panels[_TIGHTNESS], each.volume, at, **style)
+    for name, count in led_into.items():
+        at = names.index(name) if name in names else len(names) - 1
+        panels[_LED_INTO].barh(at, count, 0.6, color=colors.get(name, INK), alpha=0.9, zorder=2)
+        _write_count(panels[_LED_INTO], f"{count:,} of {report.executed.steps:,}", count, at)
+    for title, axes in panels.items():
+        # Room for the counts beside the bars.
+        is_count = title in flaws or title == _LED_INTO
+        axes.set_xlim(0, max(1.0, 1.6 * axes.get_xlim()[1]) if is_count else 104)
 
 
 def _draw_share(
@@ -123,22 +142,22 @@ def _draw_share(
     color: str,
     *,
     faint: bool,
-    told: bool,
+    counted: bool,
 ) -> None:
     if share is None or share.share is None:
-        said = "not judged" if share is None else "no state"
-        axes.annotate(said, (0, at), (3, 0), textcoords="offset points", va="center", color=MUTED)
+        _write_count(axes, "not judged" if share is None else "no state", 0, at, color=MUTED)
         return
     percent = 100 * share.share
     axes.barh(at, percent, height, color=color, alpha=0.4 if faint else 0.9, zorder=2)
-    if told:
-        said = f"{share.count:,} of {share.of:,}"
-        axes.annotate(
-            said, (percent, at), (3, 0), textcoords="offset points", va="center", fontsize=7.5
-        )
+    if counted:
+        _write_count(axes, f"{share.count:,} of {share.of:,}", percent, at, fontsize=7.5)
         return
     error = [[max(percent - 100 * share.low, 0)], [max(100 * share.high - percent, 0)]]
     axes.errorbar(percent, at, xerr=error, color=INK, linewidth=1, capsize=2, zorder=3)
+
+
+def _write_count(axes: Axes, text: str, x: float, y: float, **style: Any) -> None:
+    axes.annotate(text, (x, y), (3, 0), textcoords="offset points", va="center", **style)
 
 
 def _draw_spread(
@@ -178,7 +197,7 @@ def _draw_scene(
     axes.set_xlabel("$a_1$")
     axes.set_ylabel("$a_2$")
     axes.set_title(
-        f"worst for {scene.name}, {scene.source}: {scene.reason}\n{_told(scene.state)}",
+        f"worst for {scene.name}, {scene.source}: {scene.reason}\n{_state_text(scene.state)}",
         fontsize=8.5,
     )
 
@@ -189,7 +208,7 @@ def _kinds(scene: WorstState) -> list[NDArray[np.bool_]]:
     return [bad & ~inside, ~bad & ~inside, ~bad & inside & ~dead, dead, bad & inside]
 
 
-def _told(state: Mapping[str, object]) -> str:
+def _state_text(state: Mapping[str, object]) -> str:
     """Return a state in few words, or nothing where it has many entries."""
     parts = []
     for name, value in state.items():
@@ -207,17 +226,20 @@ def _source_entries(sources: list[str]) -> list[Patch]:
     ]
 
 
-def _write_remarks(axes: Axes, report: AuditReport) -> None:
+def _write_remarks(axes: Axes, report: AuditReport, *, has_scenes: bool) -> None:
     """Write the meaning of the marks, and the first flaws."""
     axes.set_axis_off()
-    entries = [
-        Line2D([], [], linestyle="none", **{**mark, "markersize": 8, "label": meaning})
-        for meaning, mark in _MARKS.items()
-    ]
-    entries.append(Line2D([], [], color=INK, linewidth=1, label="what all sets together leave"))
-    axes.legend(handles=entries, loc="upper left", title="actions tried in that state")
-    lines = [fill(flaw, 48) for flaw in report.flaws[:_MOST_FLAWS]]
+    if has_scenes:
+        entries = [
+            Line2D([], [], linestyle="none", **{**mark, "markersize": 8, "label": meaning})
+            for meaning, mark in _MARKS.items()
+        ]
+        entries.append(Line2D([], [], color=INK, linewidth=1, label="what all sets together leave"))
+        axes.legend(handles=entries, loc="upper left", title="actions tried in that state")
+    width = 48 if has_scenes else 150
+    lines = [fill(flaw, width) for flaw in report.flaws[:_MOST_FLAWS]]
     if len(report.flaws) > _MOST_FLAWS:
         lines.append(f"and {len(report.flaws) - _MOST_FLAWS} more")
     text = "\n".join(lines)
-    axes.text(0.02, 0.0, text, transform=axes.transAxes, va="bottom", fontsize=8, color=_FLAW)
+    at, align = (0.0, "bottom") if has_scenes else (1.0, "top")
+    axes.text(0.02, at, text, transform=axes.transAxes, va=align, fontsize=8, color=_FLAW)

@@ -32,7 +32,6 @@ def draw_run_figures(
     folder: RunFolder,
     *,
     trusted: Sequence[str] = (),
-    states: int = 256,
     episodes: int = 6,
     dpi: int = 130,
 ) -> list[Path]:
@@ -44,7 +43,6 @@ def draw_run_figures(
     Args:
         folder: with configuration and checkpoint.
         trusted: see `RunFolder.load_config`.
-        states: number looked at at once for telling ones.
         episodes: number of those drawn.
         dpi: dots per inch.
     """
@@ -52,15 +50,13 @@ def draw_run_figures(
     # A run that goes on after its figures draws the same random numbers as without them.
     with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         torch.manual_seed(config.seed)
-        figures = _figures(folder, config, states, episodes)
+        figures = _figures(folder, config, episodes)
     target = folder.path / FIGURES
     return [save_png(figure, target / f"{name}.png", dpi=dpi) for name, figure in figures.items()]
 
 
-def _figures(
-    folder: RunFolder, config: DictConfig, states: int, episodes: int
-) -> dict[str, Figure]:
-    env = _environment(config, states)
+def _figures(folder: RunFolder, config: DictConfig, episodes: int) -> dict[str, Figure]:
+    env = _environment(config)
     actor = load_actor(folder, config, env)
     head = flow_head(actor)
     names = list(dict.fromkeys([*head.order, *counted_constraints(env)]))
@@ -94,8 +90,9 @@ def _trajectories(
     )
 
 
-def _environment(config: DictConfig, batch: int) -> TransformedEnv:
-    env = build_environment(config, batch_size=[batch], with_anchor=True)
+def _environment(config: DictConfig, batch: int | None = None) -> TransformedEnv:
+    size = None if batch is None else [batch]
+    env = build_environment(config, batch_size=size, with_anchor=True)
     env.set_seed(config.evaluation.seed)
     return env
 

@@ -24,7 +24,7 @@ SEVERAL = [
     "+env.layout.stations=[[-0.9,0.0]]",
 ]
 
-draw = partial(draw_run_figures, states=64, episodes=2, dpi=50)
+draw = partial(draw_run_figures, episodes=2, dpi=50)
 
 RunFactory = Callable[[DictConfig], RunFolder]
 
@@ -100,7 +100,7 @@ def test_same_run_gives_the_same_pictures(make_run: RunFactory) -> None:
     once = {path.name: path.read_bytes() for path in draw(folder)}
     shutil.rmtree(folder.path / "figures")
     torch.rand(3)
-    again = instantiate(config.figures)(folder, states=64, episodes=2, dpi=50)
+    again = instantiate(config.figures)(folder, episodes=2, dpi=50)
     assert once == {path.name: path.read_bytes() for path in again}
 
 

@@ -1,0 +1,48 @@
+"""Single episodes, step by step, to be looked at."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.modules import guarded
+from cnfp_torchrl.training.evaluation import transitions
+from cnfp_torchrl.training.settings import EvaluationSettings
+
+
+@torch.no_grad()
+def record_episode(
+    env: EnvBase,
+    actor: SafeProbabilisticTensorDictSequential,
+    settings: EvaluationSettings,
+    number: int = 0,
+    *,
+    deterministic: bool = False,
+) -> list[TensorDictBase]:
+    """Return the transitions of one episode, each of batch size ``()``.
+
+    An episode has a seed of its own, so that none depends on how many others are run.
+
+    Args:
+        env: the environment with anchor and active flags; a batch of one takes the least time, of
+            more the first agent is recorded.
+        actor: the actor.
+        settings: seed of the first episode, and the length at which episodes are cut off.
+        number: number of the episode, from 0.
+        deterministic: take `deterministic_sample` instead of drawing.
+    """
+    env.set_seed(settings.seed + number)
+    torch.manual_seed(settings.seed + number)
+    mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    episode: list[TensorDictBase] = []
+    with set_exploration_type(mode):
+        for transition in islice(transitions(env, guarded(actor, env)), settings.max_steps):
+            episode.append(transition.reshape(-1)[0].clone())
+            if bool(episode[-1]["next", "done"].any()):
+                break
+    return episode
