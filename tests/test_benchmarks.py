@@ -50,3 +50,15 @@ def test_what_is_measured_on_a_gpu_is_tabulated(tmp_path: Path) -> None:
     assert not [key for key in document["about"] if key.endswith("failed")]
     text = (tmp_path / "gpu.md").read_text()
     assert all(f"## {title}" in text for title in document["results"])
+
+
+def test_anchors_are_timed_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "anchor_times.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    holds, relaxed = json.loads((tmp_path / "anchors.json").read_text())["rows"]
+    assert holds["relaxed"] == 0
+    assert relaxed["relaxed"] == 0.25
+    text = (tmp_path / "anchors.md").read_text()
+    for row in (holds, relaxed):
+        assert 0 < row["/ flow"]["low"] <= row["/ flow"]["ratio"] <= row["/ flow"]["high"]
+        assert f"| {row['ms']['anchor']:.2f} |" in text
