@@ -2,6 +2,7 @@
 
 from cnfp_torchrl.envs.action_guard import ActionGuard
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.camera import Camera, can_render
 from cnfp_torchrl.envs.constrain_env import constrain_env
 from cnfp_torchrl.envs.constrained_actions import ConstrainedActions
 from cnfp_torchrl.envs.cost import (
@@ -19,14 +20,17 @@ from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_s
 from cnfp_torchrl.envs.task_view import (
     NOTHING,
     Boxes,
+    Component,
     Discs,
     Map,
     Marks,
     Polyline,
     Series,
     Shape,
+    ShowTask,
     StateSetter,
     TaskView,
+    environment_layers,
     find_task_view,
 )
 
@@ -37,6 +41,8 @@ __all__ = [
     "NOTHING",
     "ActionGuard",
     "Boxes",
+    "Camera",
+    "Component",
     "ConstrainedActions",
     "ConstraintAnchor",
     "ConstraintCost",
@@ -53,13 +59,16 @@ __all__ = [
     "SampledGeometry",
     "Series",
     "Shape",
+    "ShowTask",
     "StateSetter",
     "TaskView",
     "appended_transforms",
+    "can_render",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
     "constraints_to_sample",
     "counted_constraints",
+    "environment_layers",
     "find_task_view",
 ]

@@ -13,6 +13,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 from cnfp_torchrl.envs import (
     GeometryTransform,
     RewardPenalty,
+    ShowTask,
     constrain_env,
     counted_constraints,
 )
@@ -52,6 +53,9 @@ def build_environment(
         base.close()  # each of its environments is a process: no more of them than in training
         base = instantiate(config.env.base, _convert_="all")
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
+    view = instantiate(config.env.get("view"), _convert_="all")
+    if view is not None:
+        env.append_transform(ShowTask(view))
     penalty = _penalty(config) if with_penalty else None
     if penalty is not None:  # behind the sum, which is of the reward without it
         env.append_transform(penalty)
