@@ -5,7 +5,8 @@ from __future__ import annotations
 import traceback
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -34,6 +35,27 @@ class HostReads(TorchDispatchMode):
         """The number of reads."""
         return self.lines.total()
 
+    def __enter__(self) -> Self:
+        # It reads without an operation that is dispatched.
+        tolist = Tensor.tolist
+
+        def counted(tensor: Tensor) -> Any:
+            self._count("tolist")
+            return tolist(tensor)
+
+        self._patch = patch.object(Tensor, "tolist", counted)
+        self._patch.start()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._patch.stop()
+        super().__exit__(*error)
+
+    def _count(self, name: str) -> None:
+        frames = [f for f in traceback.extract_stack() if "cnfp_torchrl" in f.filename]
+        at = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "elsewhere"
+        self.lines[f"{at} {name}"] += 1
+
     def __torch_dispatch__(
         self,
         func: Any,
@@ -47,7 +69,5 @@ class HostReads(TorchDispatchMode):
             for each in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
         )
         if name in _WAITS or masked:
-            frames = [f for f in traceback.extract_stack() if "cnfp_torchrl" in f.filename]
-            at = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "elsewhere"
-            self.lines[f"{at} {name}"] += 1
+            self._count(name)
         return func(*args, **(kwargs or {}))

@@ -17,6 +17,7 @@ TINY = [
     "training.update_ratio=0.05",
     "evaluation.episodes=2",
     "+env.base.max_steps=5",
+    "collector.frames_per_batch=16",
 ]
 
 
@@ -25,11 +26,16 @@ def composed(*overrides: str, name: str = "train") -> DictConfig:
         return compose(name, overrides=list(overrides))
 
 
+# What belongs to another algorithm than the default runs as a part of it.
+PARTS = {("loss", "ppo"), ("loss", "td3"), ("network", "deterministic"), ("network", "state_value")}
 OPTIONS = sorted(
     str(path.relative_to(config_directory()).with_suffix(""))
     for path in config_directory().glob("*/**/*.yaml")
     # Those that need a viewer, a port or a display have tests of their own.
     if path.parent.name != "visual" or path.stem in ("off", "file")
+    # Those of another algorithm than the default are parts of its option.
+    if path.stem not in ("ppo", "td3", "deterministic", "state_value")
+    or path.parent.name == "algorithm"
 )
 
 

@@ -223,3 +223,14 @@ def test_an_update_waits_for_nothing(moves_actor: bool) -> None:
     with no_synchronization():
         losses = update(batch)
     assert all(value.isfinite() for value in losses.values())
+
+
+def test_a_step_waits_once_more_than_without_constraints() -> None:
+    counts = []
+    for env in (PointNavEnv([256], device="cuda", seed=0), environment(256)):
+        for _ in range(2):
+            state = env.reset()
+            state["action"] = torch.zeros(256, 2, device="cuda")
+            counts.append(synchronizations(lambda: env.step(state)))  # noqa: B023 - called at once
+    _, plain, _, constrained = counts
+    assert constrained <= plain + 1

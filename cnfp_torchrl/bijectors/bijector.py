@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -105,6 +106,15 @@ class Bijector(Transform):
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Return log|det dy/dx| at the latent x; y is not used."""
         return self.forward_and_log_det(x)[1]
+
+
+def stacked(stages: Iterable[tuple[Tensor, Tensor]]) -> Stages:
+    """Return the actions and log-determinants of all stages, broadcast and stacked."""
+    actions, log_dets = zip(*stages, strict=True)
+    return Stages(
+        torch.stack(torch.broadcast_tensors(*actions)),
+        torch.stack(torch.broadcast_tensors(*log_dets)),
+    )
 
 
 def has_latent(latent: Tensor, log_det: Tensor) -> Tensor:

@@ -8,13 +8,13 @@ towards an interior point until it is allowed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn.functional import threshold
 
-from cnfp_torchrl.bijectors.bijector import Bijector, Stages
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages, stacked
 from cnfp_torchrl.bijectors.squashes import BoxSquash
 from cnfp_torchrl.geometry import (
     Box,
@@ -91,19 +91,13 @@ class ExactSquash(Bijector):
         offset, log_slopes = self._squash.forward_and_log_slopes(latent)
         sets = self.region.sets
         # Flows of the first constraints, not one flow cut open: later boxes rescale earlier stages.
-        stages = [
+        return stacked(
             self._retraction_into(sets[1:stage]).forward_and_log_det(offset, log_slopes)
             for stage in range(1, len(sets) + 1)
-        ]
-        actions, log_dets = zip(*stages, strict=True)
-        return Stages(
-            torch.stack(torch.broadcast_tensors(*actions)),
-            torch.stack(torch.broadcast_tensors(*log_dets)),
         )
 
-    def _retraction_into(self, sets: Sequence[ConstraintSet]) -> _Retraction:
-        boxes = [s for s in sets if self.scales_by_boxes and isinstance(s, Box)]
-        others = [s for s in sets if not (self.scales_by_boxes and isinstance(s, Box))]
+    def _retraction_into(self, sets: Sequence[ConstraintSet]) -> OffsetRetraction:
+        boxes, others = split(sets, by_boxes=self.scales_by_boxes)
         return _Retraction(self._squash.image, boxes, others, self.region.anchor)
 
 
@@ -121,6 +115,19 @@ class GaugeSquash(ExactSquash):
     """
 
     scales_by_boxes = False
+
+
+class OffsetRetraction(Protocol):
+    """A bijection from offsets within the action bounds onto actions within further sets."""
+
+    def forward(self, offset: Tensor) -> Tensor:
+        """Return the action of an offset."""
+
+    def forward_and_log_det(self, offset: Tensor, log_slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action and the log-determinant of the map from the latent to it."""
+
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the offset of an action and the log-determinant of the map from it to that."""
 
 
 class _Retraction:
@@ -188,6 +195,14 @@ class _Retraction:
             return self._anchor + scaled
         # Not a quotient, whose gradient takes more passes.
         return torch.addcmul(self._anchor, scaled, contraction.reciprocal().unsqueeze(-1))
+
+
+def split(
+    sets: Sequence[ConstraintSet], *, by_boxes: bool
+) -> tuple[list[Box], list[ConstraintSet]]:
+    """Return the boxes among some sets, if they retract by components, and the other sets."""
+    boxes = [each for each in sets if by_boxes and isinstance(each, Box)]
+    return boxes, [each for each in sets if not (by_boxes and isinstance(each, Box))]
 
 
 class _ComponentScale:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -12,11 +14,14 @@ from cnfp_torchrl.commands.extras import needs_extra
 with needs_extra("train"):
     import hydra
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
     from hydra.utils import instantiate
     from omegaconf import DictConfig, OmegaConf
 
     from cnfp_torchrl.commands.paths import takes_any_path
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
+    from cnfp_torchrl.commands.sweep import report
+    from cnfp_torchrl.commands.sweep_folders import STARTED, sweep_arguments
     from cnfp_torchrl.configuration import config_directory
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
@@ -70,29 +75,71 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-@takes_any_path
+def _objective(summary: Mapping[str, Any]) -> float:
+    """Return what a sweeper maximizes: the score, or the return of a task without one.
+
+    A run that broke a constraint is no candidate, however well it scored.
+    """
+    if any(summary["violations"].values()):
+        return -math.inf
+    score = summary["score"]
+    return float(summary["return_mean"] if score is None else score)
+
+
+def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
+    """Return a new folder for a new run, or that of a run to go on with and its configuration."""
+    hydra_config = HydraConfig.get()
+    output, resumed = hydra_config.runtime.output_dir, config.resume
+    overrides = hydra_config.overrides.task
+    # Slurm starts a job that was preempted, or ran out of time, once more and in the same way.
+    if int(os.environ.get("SLURM_RESTART_COUNT", "0")) and RunFolder(output).has_started:
+        resumed, overrides = output, []
+    if resumed is not None:
+        folder = RunFolder.resume(resumed)
+        return folder, resumed_config(folder, config, overrides, config.trusted)
+    folder = RunFolder.create(output)
+    _save_hydra_files(folder, config)
+    return folder, config
+
+
 @hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
-def main(config: DictConfig) -> float | None:
-    """Train, draw the run's figures, print the summary, and return the score for sweeps."""
+def _main(config: DictConfig) -> float:
+    """Train, draw the run's figures, print the summary, and return what a sweep maximizes."""
     with told_in_a_sentence():
-        if config.resume is None:
-            folder = RunFolder.create(HydraConfig.get().runtime.output_dir)
-            _save_hydra_files(folder, config)
-        else:
-            folder = RunFolder.resume(config.resume)
-            overrides = HydraConfig.get().overrides.task
-            config = resumed_config(folder, config, overrides, config.trusted)
+        is_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
+        folder, config = _folder_and_config(config)
         try:
             summary = train(config, folder, resume=folder.has_started)
         except TrainingInterrupted as stop:
             sys.stderr.write(f"{stop}\n")
             sys.exit(128 + stop.number)
+        except Exception as error:
+            if is_sweep or folder.has_started:
+                folder.save_failure(error)
+            raise
         finally:
-            _remove_unless_started(folder)
+            # A sweep tells of those that were refused.
+            if not is_sweep:
+                _remove_unless_started(folder)
+        folder.forget_failure()
         if config.figures:
             instantiate(config.figures)(folder)
         sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
-        return summary["score"]
+        return _objective(summary)
+
+
+@takes_any_path
+def main() -> None:
+    """Train a run, or the runs of a sweep, of which a table is printed at the end."""
+    sys.argv += sweep_arguments(sys.argv[1:])
+    try:
+        _main()
+    finally:
+        # Also after a run that failed, which is why the others are worth a look.
+        for sweep in STARTED:
+            if sweep.is_dir() and any(sweep.iterdir()):
+                sys.stdout.write(f"{report(sweep)}\n")
+        STARTED.clear()
 
 
 if __name__ == "__main__":

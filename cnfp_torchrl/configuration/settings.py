@@ -8,6 +8,7 @@ from dataclasses import fields
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:  # a module of type stubs, which cannot be imported
@@ -32,6 +33,16 @@ def _is_number(given: Any) -> bool:
 
 def _is_whole(given: Any) -> bool:
     return isinstance(given, Integral) and not isinstance(given, bool)
+
+
+def _devices() -> list[str]:
+    """Return the names of the devices that PyTorch can use here."""
+    accelerators = [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    return ["cpu", *(["cuda", *accelerators] if accelerators else [])]
+
+
+def _is_device(given: Any) -> bool:
+    return isinstance(given, str) and given in _devices()
 
 
 def _list_of(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
@@ -62,14 +73,18 @@ COUNTS = Expected("a list of whole numbers >= 1", _list_of(COUNT.accepts))
 COSTS = Expected("a list of finite numbers >= 0", _list_of(NOT_NEGATIVE.accepts))
 NAMES = Expected("a list of the constraints' names", _list_of(lambda x: isinstance(x, str)))
 PAIRS = Expected("a list of pairs such as [[0, 1]]", _list_of(lambda _: True))
+DEVICE = Expected(f"a device of this machine: {', '.join(_devices())}", _is_device)
 
 EXPECTED = {
     "seed": WHOLE,
     "threads": COUNT,
+    "device": DEVICE,
     "compile": FLAG,
     "batch": COUNT,
     "env.agents": COUNT,
     "env.order": NAMES,
+    "env.gamma": DISCOUNT,
+    "env.target_entropy": ENTROPY,
     "env.penalty.penalty": POSITIVE,
     "env.score.zero": NUMBER,
     "env.score.one": NUMBER,
@@ -82,6 +97,17 @@ EXPECTED = {
     "loss.lambda_init": POSITIVE,
     "loss.lambda_max": POSITIVE,
     "loss.num_cost_nets": COUNT,
+    "loss.lmbda": RATE,
+    "loss.clip_epsilon": POSITIVE,
+    "loss.entropy_coeff": NOT_NEGATIVE,
+    "loss.policy_noise": NOT_NEGATIVE,
+    "loss.noise_clip": NOT_NEGATIVE,
+    "network.actor.noise": POSITIVE,
+    "network.actor.reach": POSITIVE,
+    "algorithm.actor_every": COUNT,
+    "algorithm.epochs": COUNT,
+    "algorithm.minibatch": COUNT,
+    "algorithm.max_grad_norm": POSITIVE,
     "target.tau": RATE,
     "optim.lr": POSITIVE,
     "collector.total_frames": COUNT,
@@ -98,6 +124,8 @@ EXPECTED = {
     "evaluation.episodes": COUNT,
     "evaluation.seed": WHOLE,
     "evaluation.max_steps": COUNT,
+    "evaluation.interval": _or_null(COUNT),
+    "evaluation.interval_episodes": COUNT,
     "audit.states": COUNT,
     "audit.actions": COUNT,
     "audit.steps": COUNT,

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from itertools import dropwhile
+from itertools import dropwhile, takewhile
 from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
-from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, lexicographic_anchor
+from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, begin_anchor, finish_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
     ActionBounds,
@@ -86,6 +87,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._watch = RelaxationWatch([each.name for each in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
+        # Those whose checks are settled here, looked up at the first step of an episode.
+        self._geometries: list[GeometryTransform] | None = None
         # The last policy of a collector that was found to fit: each is examined once.
         self._fitting: Callable[[], nn.Module | None] = _no_policy
 
@@ -112,28 +115,51 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        found = lexicographic_anchor([bounds, *sets], candidate, self._leeway)
-        batch, largest = next_tensordict.batch_size, found.largest()
-        self._watch([bounds, *sets], largest, batch.numel())
+        begun = begin_anchor([bounds, *sets], candidate)
+        batch = next_tensordict.batch_size
+        if self._settled(begun.attempt.decided.all()):
+            found = begun.all_held()
+            self._watch.all_held(batch.numel())
+        else:
+            found = finish_anchor(begun, self._leeway)
+            self._watch([bounds, *sets], found.largest(), batch.numel())
         next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
         for stage, bijector in enumerate(self._bijectors, start=1):
+            rows = found.relaxation[stage].expand(*batch, found.relaxation[stage].shape[-1])
+            largest = rows.squeeze(-1) if rows.shape[-1] == 1 else rows.amax(-1)
             next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))
-            next_tensordict.set(bijector.relaxation_key, largest[..., stage].expand(batch))
+            next_tensordict.set(bijector.relaxation_key, largest)
             if bijector.row_relaxation_key is not None:
-                rows = found.relaxation[stage]
-                rows = rows.expand(*batch, rows.shape[-1])
                 next_tensordict.set(bijector.row_relaxation_key, rows)
         return next_tensordict
+
+    def _settled(self, decided: Tensor) -> bool:
+        """Settle the checks of all geometries, and tell whether all states are decided.
+
+        Their flags are read on the host together: on a GPU each read waits.
+        """
+        if self._geometries is None:
+            appended = appended_transforms(self.container)
+            before = takewhile(lambda each: each is not self, appended)
+            self._geometries = [each for each in before if isinstance(each, GeometryTransform)]
+        checks = [check for each in self._geometries if (check := each.pending_check())]
+        good = torch.stack([decided, *(check.good for check in checks)]).tolist()
+        for check, is_good in zip(checks, good[1:], strict=True):
+            if not is_good:
+                check.refuse()
+        return bool(good[0])
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._refuse_unseen_steps()
         self._refuse_misfit_of_collector()
+        self._geometries = None
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Fill in anchor and flags of stored transitions, at root and under next."""
+        self._geometries = []  # in a replay buffer they settle their checks themselves
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
@@ -193,7 +219,9 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         """Return a copy without environment, which keeps the action bounds of this one's."""
         if self.parent is not None:
             self._action_bounds()
-        return super().clone()
+        copy = super().clone()
+        copy._geometries = None
+        return copy
 
     def _action_bounds(self, device: torch.device | None = None) -> Box:
         if self._bounds is None:

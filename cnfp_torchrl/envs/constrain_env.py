@@ -24,6 +24,7 @@ def constrain_env(
     *geometries: GeometryTransform,
     order: Sequence[str] | None = None,
     with_anchor: bool = True,
+    validate: bool | None = None,
 ) -> TransformedEnv:
     """Return an environment that publishes the geometry of its constraints in every state.
 
@@ -39,6 +40,8 @@ def constrain_env(
             (lexicographic priority); None takes the order of the geometries.
         with_anchor: Whether to publish anchor, active flags and relaxations. Flows that guarantee
             nothing (``squash``, ``unconstrained``) act without them, and steps take less time.
+        validate: Whether the values that the geometries read and return are checked at each step,
+            see `GeometryTransform`; None leaves that to each of them.
 
     Raises:
         TypeError: when the environment is no `EnvBase`, a geometry is no `GeometryTransform` (but
@@ -59,6 +62,8 @@ def constrain_env(
                 f"geometries: expected each to be a GeometryTransform, given {_kind(geometry)}; "
                 f"{_EXAMPLE}"
             )
+        if validate is not None:
+            geometry.validate = validate
     action_bounds(env.full_action_spec, env.action_key)
     before = constraint_bijectors(env) if publishes_constraints(env) else []
     refuse_string("order", order)

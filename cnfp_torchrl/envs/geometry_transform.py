@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from typing import NamedTuple, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.linalg import vector_norm
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
@@ -40,10 +43,13 @@ class GeometryTransform(Transform, ConstraintPublisher):
     step, and in the specs. In a replay buffer (``buffer.append_transform``) they are computed at
     sampling, at the root and under ``next``, instead of being stored.
 
-    Everything is checked here, eagerly, once a step, so that nothing has to be checked later in
-    compiled code. A set must be valid in every state, even where no action keeps the constraint:
-    publish one that misses the action bounds there. It is relaxed in that state, and the relaxation
-    is published. The sets of all states are of one family.
+    Everything is checked once a step, so that nothing has to be checked later in compiled code. In
+    an environment of `constrain_env` all checks of a step are read on the host together with
+    whether the anchors need a search: on a GPU it is waited for once.
+
+    A set must be valid in every state, even where no action keeps the constraint: publish one that
+    misses the action bounds there. It is relaxed in that state, and the relaxation is published.
+    The sets of all states are of one family.
 
     Args:
         name: The constraint's name, by which flow and order refer to it.
@@ -57,6 +63,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
             ``torch.int8``, divides the action bounds. The set is moved inwards by half of the
             grid's diagonal, so that the rounded action lies in the set that was stated. Action
             bounds are not moved: they are to be points of the grid.
+        validate: Whether the values that `constraint_set` reads and returns are checked at each
+            step. Without it NaN or a set that is none leads to actions that guarantee nothing.
 
     Raises:
         ValueError: for a bad or reserved name, a margin below 0 or a resolution that is no step.
@@ -69,6 +77,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     _family: type[ConstraintSet] | None = None
     _is_compared = False
+    _is_settled_by_another = False
+    _check: _Check | None = None
+    _valid_shapes: list[tuple[torch.Size, torch.dtype]] | None = None
 
     def __init__(
         self,
@@ -77,6 +88,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         *,
         margin: float = 0.0,
         resolution: float | torch.dtype | None = None,
+        validate: bool = True,
     ) -> None:
         if not isinstance(name, str) or not name or name in RESERVED_NAMES:
             raise ValueError(
@@ -90,7 +102,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if isinstance(resolution, int | float) and not 0 < resolution < math.inf:
             raise ValueError(f"resolution: expected a step > 0 or a dtype, given {resolution}")
         self.name = name
-        self.margin, self.resolution = margin, resolution
+        self.margin, self.resolution, self.validate = margin, resolution, validate
         self._inwards: float | None = None
 
     @abstractmethod
@@ -143,6 +155,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
             self._refuse_what_is_no_set(allowed)
             self._family = type(allowed)
         return self._moved_inwards(allowed)
+
+    def entries(self, tensordict: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
+        """Return what is published in some states, without a check, as exported programs need it.
+
+        Args:
+            tensordict: States of any batch size; not changed.
+        """
+        return self._entries(tensordict, self.checked_set(tensordict))
 
     def _validated(self, allowed: ConstraintSet) -> ConstraintSet:
         try:
@@ -202,7 +222,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
         state = observation_spec.zero()
         try:
             allowed = self.checked_set(state)
-            self._refuse_shapes_that_follow_the_batch(state)
+            entries = self._entries(state, allowed)
+            if state.numel():
+                self._refuse_what_follows_the_batch(state, allowed)
         except Exception as error:
             error.add_note(
                 "called for the zero of the observation spec, which need not be a state of the "
@@ -210,7 +232,6 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 "returned for it; its values are not used, so that any will do"
             )
             raise
-        entries = self._entries(state, allowed)
         self._refuse_slack_of_wrong_shape(allowed, state.batch_size)
         for key, value in entries.items():
             if key in published:
@@ -223,22 +244,70 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Publish at the root and, where it exists, under ``next``: for use in a replay buffer."""
+        self._is_settled_by_another = False
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key in self.in_keys:
-            self._refuse_what_is_not_finite(key, next_tensordict.get(key))
-        allowed = self._validated(self.checked_set(next_tensordict))
+        try:
+            allowed = self.checked_set(next_tensordict)
+        except Exception:
+            self._refuse_what_is_not_finite(next_tensordict)  # the likely cause
+            raise
+        if self.validate:
+            self._check_values(next_tensordict, allowed)
         entries = self._entries(next_tensordict, allowed)
         if not self._is_compared and next_tensordict.numel() > 1:
-            self._refuse_sets_of_other_states(next_tensordict, entries)
+            self._refuse_what_follows_the_batch(next_tensordict, allowed)
             self._is_compared = True
         for key, value in entries.items():
             next_tensordict.set(key, value)
         return next_tensordict
+
+    def pending_check(self) -> _Check | None:
+        """Return the check of the last states for the caller to settle, as from now on each time.
+
+        For a transform behind this one that settles the checks of several at once.
+        """
+        check, self._check = self._check, None
+        self._is_settled_by_another = True
+        return check
+
+    def _check_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
+        inputs = (states.get(key) for key in self.in_keys)
+        good = [
+            vector_norm(value, torch.inf) < torch.inf
+            for value in inputs
+            if value.is_floating_point() and value.numel()
+        ]
+        shapes = [(value.shape, value.dtype) for value in allowed.fields().values()]
+        if shapes != self._valid_shapes:
+            allowed.validate_shapes(self._where(allowed))
+            self._valid_shapes = shapes
+        check = _Check(
+            torch.stack([*good, allowed.is_valid()]).all(),
+            partial(self._refuse_values, states, allowed),
+        )
+        if self._is_settled_by_another and self._check is None:
+            self._check = check
+            return
+        # Nobody has settled the last one: whoever did is not behind this transform any more.
+        left, self._check, self._is_settled_by_another = self._check, None, False
+        for each in (left, check):
+            if each is not None and not bool(each.good):
+                each.refuse()
+
+    def _refuse_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
+        self._refuse_what_is_not_finite(states)
+        self._validated(allowed)
+
+    def clone(self) -> Self:
+        """Return a copy without environment, which settles its checks itself."""
+        copy = super().clone()
+        copy._check, copy._is_settled_by_another = None, False
+        return copy
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -283,6 +352,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
             error.add_note(f"raised by {self._at(method)}")
             raise
 
+    def _where(self, allowed: ConstraintSet) -> str:
+        return f"constraint '{self.name}' ({type(allowed).__name__})"
+
     def _refuse_what_is_no_set(self, allowed: ConstraintSet) -> None:
         family = type(allowed)
         if not isinstance(allowed, ConstraintSet):
@@ -290,65 +362,52 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 f"{self._at('constraint_set')}: expected it to return a ConstraintSet such as "
                 f"cnfp_torchrl.geometry.Ball, given {family.__name__}"
             )
-        where = f"constraint '{self.name}' ({family.__name__})"
         if self._family is not None:
             raise GeometryError(
-                f"{where}: expected a {self._family.__name__}, as in the states before, given a "
-                f"{family.__name__}; return sets of one family in all states"
+                f"{self._where(allowed)}: expected a {self._family.__name__}, as in the states "
+                f"before, given a {family.__name__}; return sets of one family in all states"
             )
-        allowed.validate_shapes(where)
+        allowed.validate_shapes(self._where(allowed))
 
-    def _refuse_shapes_that_follow_the_batch(self, state: TensorDictBase) -> None:
-        """Refuse fields with the states' batch in a dimension that belongs to a single set.
+    def _refuse_what_follows_the_batch(
+        self, states: TensorDictBase, allowed: ConstraintSet
+    ) -> None:
+        """Refuse sets of states that are not those of the same states in another batch.
 
         One half-space for each state, given as normals ``(*batch, d)``, has the shape of a single
-        set of as many half-spaces as there are states.
-        """
-        if state.numel() == 0:
-            return
-        one = state.reshape(-1)[:1]
-        shapes = []
-        for size in (2, 3):
-            allowed = self.checked_set(one.expand(size).clone())
-            shapes.append(
-                {
-                    field: tuple(value.shape[value.ndim - allowed.event_dims[field] :])
-                    for field, value in allowed.fields().items()
-                }
-            )
-        for field, shape in shapes[0].items():
-            if shapes[1][field] != shape:
-                raise GeometryError(
-                    f"constraint '{self.name}', field '{field}': expected one shape of a state's "
-                    f"set whatever the batch, given {shape} for 2 states and {shapes[1][field]} "
-                    "for 3; put the batch first, and then what belongs to one set: a single "
-                    "half-space for each state has normals (*batch, 1, d) and offsets (*batch, 1)"
-                )
-
-    def _refuse_sets_of_other_states(
-        self, states: TensorDictBase, entries: Mapping[tuple[str, ...], Tensor]
-    ) -> None:
-        """Refuse, at the first batch of states, sets that are not those of the states alone.
-
-        ``observation[0, 3:]`` in place of ``observation[..., 3:]`` has the shape of a set that all
-        states share, and is the first state's. Compared for the last state, up to the rounding of
-        other batch sizes.
+        set of as many half-spaces as there are states. ``observation[0, 3:]`` in place of
+        ``observation[..., 3:]`` has the shape of a set that all states share, and is the first
+        state's. Compared for the last state, alone or twice, up to the rounding of other batch
+        sizes.
         """
         last = states.reshape(-1)[-1:]
-        allowed = self._validated(self.checked_set(last))
-        if allowed.batch_shape.numel() > 1:
-            # Limits of its own for each environment of this batch, which no state tells.
-            return
+        other = self.checked_set(last if states.numel() > 1 else last.expand(2).clone())
+        # Not with limits of its own for each environment of this batch, which no state tells.
+        compares = other.batch_shape.numel() == 1 or states.numel() == 1
         for field, value in allowed.fields().items():
-            batched = entries[field_key(self.name, field)].flatten(0, states.ndim - 1)[-1]
-            single = value.expand(1, *batched.shape)[0]
-            atol = 1e-5 * float(batched.masked_fill(batched.isinf(), 0).abs().amax())
-            if not torch.allclose(single, batched, rtol=1e-3, atol=atol):
+            event, batch = allowed.event_dims[field], states.batch_size
+            given, alone = value, other.fields()[field]
+            shapes = [tuple(each.shape[each.ndim - event :]) for each in (given, alone)]
+            where = f"constraint '{self.name}', field '{field}'"
+            if shapes[0] != shapes[1]:
                 raise GeometryError(
-                    f"constraint '{self.name}', field '{field}': expected that of a state whatever "
-                    f"other states are beside it, given {batched.tolist()} for the last of "
-                    f"{states.numel()} states and {single.tolist()} for the same state alone; "
-                    "compute it from each state's own entries, such as observation[..., 3:]"
+                    f"{where}: expected one shape of a state's set whatever the batch, given "
+                    f"{shapes[0]} for {states.numel()} states and {shapes[1]} for "
+                    f"{2 if states.numel() == 1 else 1}; put the batch first, and then what "
+                    "belongs to one set: a single half-space for each state has normals "
+                    "(*batch, 1, d) and offsets (*batch, 1)"
+                )
+            if not compares:
+                continue
+            given = given.expand((*batch, *shapes[0])).reshape(-1, *shapes[0])[-1]
+            alone = alone.reshape(-1, *shapes[0])[-1]
+            atol = 1e-5 * float(given.masked_fill(~given.isfinite(), 0).abs().amax())
+            if not torch.allclose(alone, given, rtol=1e-3, atol=atol, equal_nan=True):
+                raise GeometryError(
+                    f"{where}: expected that of a state whatever other states are beside it, given "
+                    f"{given.tolist()} for the last of {states.numel()} states and "
+                    f"{alone.tolist()} for the same state alone; compute it from each state's own "
+                    "entries, such as observation[..., 3:]"
                 )
 
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
@@ -359,14 +418,23 @@ class GeometryTransform(Transform, ConstraintPublisher):
         given = f"for actions {tuple(zeros.shape)} expected"
         _refuse_other_shape(f"{self._at(method)}: {given}", slack, batch)
 
-    def _refuse_what_is_not_finite(self, key: NestedKey, value: Tensor) -> None:
-        finite = value.isfinite()
-        if not bool(finite.all()):
-            index = (~finite).nonzero()[0].tolist()
-            raise GeometryError(
-                f"constraint '{self.name}', key {key!r} at index {index}: expected a finite "
-                f"number, given {value[tuple(index)].item()}"
-            )
+    def _refuse_what_is_not_finite(self, states: TensorDictBase) -> None:
+        for key in self.in_keys:
+            value = states.get(key)
+            finite = value.isfinite()
+            if not bool(finite.all()):
+                index = (~finite).nonzero()[0].tolist()
+                raise GeometryError(
+                    f"constraint '{self.name}', key {key!r} at index {index}: expected a finite "
+                    f"number, given {value[tuple(index)].item()}"
+                )
+
+
+class _Check(NamedTuple):
+    """Whether values are as they must be, boolean ``()``, and what raises if they are not."""
+
+    good: Tensor
+    refuse: Callable[[], None]
 
 
 def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> None:

@@ -35,7 +35,10 @@ class RelaxationWatch:
     def __init__(self, names: Sequence[str], leeway: float) -> None:
         self._names, self._leeway = tuple(names), leeway
         self._looks_left = LOOKS if names else 0
-        self._seen = 0
+        self._begin_look()
+
+    def _begin_look(self) -> None:
+        self._seen, self._have_all_held = 0, False
         self._had: Tensor | None = None
         self._least: Tensor | None = None
 
@@ -49,6 +52,25 @@ class RelaxationWatch:
         """
         if not self._looks_left:
             return
+        if not self._have_all_held:
+            self._take_in(sets, relaxation)
+        self._count(states)
+
+    def all_held(self, states: int) -> None:
+        """Take in a batch of states in which no constraint gave way; reads nothing."""
+        if self._looks_left:
+            self._have_all_held = True
+            self._count(states)
+
+    def _count(self, states: int) -> None:
+        self._seen += states
+        if self._seen >= STATES:
+            if not self._have_all_held:
+                self._look()
+            self._looks_left = max(self._looks_left - 1, 0)
+            self._begin_look()
+
+    def _take_in(self, sets: Sequence[ConstraintSet], relaxation: Tensor) -> None:
         amounts = relaxation[..., 1:].reshape(-1, len(self._names))
         floor = relaxation_floor(sets, self._leeway)[..., 1:]
         # Where a set is empty, its rounding, and with it the floor, may be anything.
@@ -56,16 +78,18 @@ class RelaxationWatch:
         had, least = ~gave_way.reshape(-1, len(self._names)).all(0), amounts.amin(0)
         if self._had is not None and self._least is not None and self._had.device == had.device:
             had, least = had | self._had, torch.minimum(least, self._least)
-        self._had, self._least, self._seen = had, least, self._seen + states
-        if self._seen >= STATES:
-            self._look(had, least)
+        self._had, self._least = had, least
 
-    def _look(self, had: Tensor, least: Tensor) -> None:
+    def _look(self) -> None:
+        assert self._had is not None
+        assert self._least is not None
         missed = [
             f"'{name}' (by {amount:.3g} or more)"
             if amount < float("inf")
             else f"'{name}' (dropped)"
-            for name, held, amount in zip(self._names, had.tolist(), least.tolist(), strict=True)
+            for name, held, amount in zip(
+                self._names, self._had.tolist(), self._least.tolist(), strict=True
+            )
             if not held
         ]
         if missed:
@@ -77,5 +101,4 @@ class RelaxationWatch:
                 RelaxedEverywhereWarning,
                 stacklevel=2,
             )
-        self._looks_left = 0 if missed else self._looks_left - 1
-        self._seen, self._had, self._least = 0, None, None
+            self._looks_left = 0

@@ -5,13 +5,20 @@ from cnfp_torchrl.geometry.anchor import (
     LEEWAY,
     Anchored,
     attempt_anchor,
+    begin_anchor,
     chebyshev_center,
+    finish_anchor,
     lexicographic_anchor,
     relaxation_floor,
     row_depths,
 )
 from cnfp_torchrl.geometry.balls import Ball, Ellipsoid, TaskSpaceBall
-from cnfp_torchrl.geometry.box import Box, gauge_of_sides, require_action_bounds, sides
+from cnfp_torchrl.geometry.box import (
+    Box,
+    gauge_of_sides,
+    require_action_bounds,
+    sides,
+)
 from cnfp_torchrl.geometry.constraint_set import (
     EROSION_IN_EPS,
     Bounds,
@@ -53,8 +60,10 @@ __all__ = [
     "VisibleRegion",
     "WeightedL1Ball",
     "attempt_anchor",
+    "begin_anchor",
     "broadcast_shape",
     "chebyshev_center",
+    "finish_anchor",
     "gauge_of_sides",
     "largest_value",
     "length",

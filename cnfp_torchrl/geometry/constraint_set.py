@@ -11,6 +11,7 @@ from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.superlevel import Superlevel
 
@@ -76,7 +77,8 @@ class ConstraintSet(ABC):
     - `inflated`: the set widened, by which a constraint that cannot hold is relaxed; a family
       without it is dropped instead,
     - `row_slacks`, `rounding`: the rows that a set is made of, which are relaxed one by one,
-    - `invalid_fields`, `shape_problem`: what makes fields invalid beyond shapes, dtypes and NaN,
+    - `finite_fields`, `invalid_fields`, `shape_problem`: what makes fields invalid beyond shapes,
+      dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
     - `superlevel`: a description of {slack >= t} that makes the search for anchors fast, and
       `part_near` if the set is not convex.
@@ -90,6 +92,8 @@ class ConstraintSet(ABC):
 
     validate_args: InitVar[bool] = dataclasses.field(default=True, kw_only=True)
     event_dims: ClassVar[Mapping[str, int]]
+    finite_fields: ClassVar[frozenset[str]] = frozenset()
+    """The fields whose numbers must be finite; others may be infinite."""
 
     def __post_init__(self, validate_args: bool) -> None:
         if validate_args:
@@ -309,9 +313,27 @@ class ConstraintSet(ABC):
             most = largest_value(self.dtype)
             huge = (value.abs() > most) & value.isfinite()
             self._refuse(where, field, huge, f"numbers up to {most:g}, the range of {self.dtype}")
+            if field in self.finite_fields:
+                self._refuse(where, field, value.isinf(), f"a finite {field}")
         for field, bad, expected in self.invalid_fields():
             self._refuse(where, field, bad, expected)
         return self
+
+    def is_valid(self) -> Tensor:
+        """Tell whether `validate` accepts the values, boolean ``()``, without reading them."""
+        most, good = largest_value(self.dtype), []
+        for field, value in self.fields().items():
+            if value.numel() == 0:
+                continue
+            if field in self.finite_fields:
+                good.append(vector_norm(value, torch.inf) <= most)
+            else:
+                size = value.abs()
+                good.append(((size <= most) | (size == torch.inf)).all())
+        bad = [mask.any() for _, mask, _ in self.invalid_fields()]
+        like = next(iter(self.fields().values()))
+        good = good or [torch.ones((), dtype=torch.bool, device=like.device)]
+        return torch.stack([*good, *(~each for each in bad)]).all()
 
     def validate_shapes(self, where: str) -> None:
         """Refuse fields of wrong types or shapes, without reading their values.

@@ -40,9 +40,9 @@ class HalfSpaces(ConstraintSet):
     offsets: Tensor
 
     event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
+    finite_fields: ClassVar[frozenset[str]] = frozenset({"normals"})
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
-        yield "normals", self.normals.isinf(), "a finite normal"
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
         size, most = self.normals.abs().amax(-1), largest_value(self.dtype)
         far = (-self.offsets / most > size) & (size > 0)

@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.box import Box, require_action_bounds
+from cnfp_torchrl.geometry.box import ACTION_RANGE, Box, require_action_bounds
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError, broadcast_shape
 
 
@@ -80,6 +80,11 @@ class Region:
                 "given a region without one; find it with Region.build(sets)"
             )
         return self._anchor
+
+    @property
+    def has_anchor(self) -> bool:
+        """Whether an anchor is known."""
+        return self._anchor is not None
 
     @property
     def bounds(self) -> Box:
@@ -225,6 +230,21 @@ class Region:
             if counts is not None:
                 sets[stage] = sets[stage].unless_dropped(counts, self.anchor, beyond)
         return type(self)(tuple(sets), self.anchor, validate_args=False)
+
+    def with_finite_bounds(self) -> Self:
+        r"""Return the region with bounds no further from the anchor than its dtype resolves.
+
+        Infinite bounds become finite ones, at :math:`2^{-13}/\epsilon` times the anchor's slack:
+        1,024 times in float32 and 5e11 times in float64. Erosion by the rounding error of actions
+        as large as that takes at most a few hundredths of the anchor's slack.
+        """
+        bounds, anchor = self.bounds, self.anchor
+        reach = self.slack(anchor) / (2**13 * torch.finfo(anchor.dtype).eps)
+        reach = reach.clamp(max=ACTION_RANGE[anchor.dtype][1] / 2).unsqueeze(-1)
+        low = torch.where(bounds.low.isinf(), anchor - reach, bounds.low)
+        high = torch.where(bounds.high.isinf(), anchor + reach, bounds.high)
+        sets = (Box(low, high, validate_args=False), *self.sets[1:])
+        return type(self)(sets, anchor, self.active, self.relaxation, validate_args=False)
 
     @classmethod
     def build(

@@ -38,6 +38,7 @@ class VisibleRegion(ConstraintSet):
     step: Tensor
 
     event_dims: ClassVar[Mapping[str, int]] = {"position": 1, "rectangles": 3, "step": 0}
+    finite_fields: ClassVar[frozenset[str]] = frozenset({"position", "step"})
 
     @staticmethod
     def walls(low: Tensor, high: Tensor) -> Tensor:
@@ -59,14 +60,13 @@ class VisibleRegion(ConstraintSet):
         low, high = self.rectangles.unbind(-2)
         nowhere = (low > high) | (low == torch.inf) | (high == -torch.inf)
         everywhere = (low.isinf() & high.isinf()).all(-1, keepdim=True).expand_as(low)
-        yield "position", self.position.isinf(), "a finite position"
         yield (
             "rectangles",
             torch.stack([nowhere, nowhere], -2),
             "low <= high, not the same infinity",
         )
         yield "rectangles", torch.stack([everywhere, everywhere], -2), "a finite bound"
-        yield "step", (self.step <= 0) | self.step.isinf(), "a finite step > 0"
+        yield "step", self.step <= 0, "a finite step > 0"
 
     def shape_problem(self) -> str | None:
         count, corners = self.rectangles.shape[-3:-1]
@@ -194,8 +194,10 @@ class VisibleRegion(ConstraintSet):
         valid = torch.cat([rising, pair.flatten(-2)], -1)
         slack = offsets - (normals * point[..., None, None, :]).sum(-1)
         best = torch.where(valid, slack, -torch.inf).argmax(-1, keepdim=True)
-        normal = normals.take_along_dim(best.unsqueeze(-1), -2).squeeze(-2)
-        offset = offsets.take_along_dim(best, -1).squeeze(-1)
+        # Not take_along_dim, with which an exported program would be one for a single batch size.
+        row = best.unsqueeze(-1).expand(*best.shape, self.dim)
+        normal = normals.expand(*best.shape[:-1], -1, -1).gather(-2, row).squeeze(-2)
+        offset = offsets.expand(*best.shape[:-1], -1).gather(-1, best).squeeze(-1)
         # In a rectangle the part is empty: 0 a + t <= -1.
         outside = valid.any(-1)
         normal = torch.where(outside.unsqueeze(-1), normal, 0.0)
@@ -254,6 +256,7 @@ class VisibleOrBox(ConstraintSet):
         **Box.event_dims,
         "in_sight": 0,
     }
+    finite_fields: ClassVar[frozenset[str]] = VisibleRegion.finite_fields | {"in_sight"}
 
     @property
     def region(self) -> VisibleRegion:

@@ -19,6 +19,8 @@ from cnfp_torchrl.modules.flows import (
     GaugeFlow,
     ProjectionFlow,
     RadialFlow,
+    RecessionFlow,
+    SoftFlow,
     SquashFlow,
     UnconstrainedFlow,
     resolve_safe_flow,
@@ -34,6 +36,7 @@ from cnfp_torchrl.modules.guard import (
     refuse_violations,
 )
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
+from cnfp_torchrl.modules.layer import ConstraintLayer
 from cnfp_torchrl.modules.network_fit import require_fit
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
@@ -42,12 +45,13 @@ from cnfp_torchrl.modules.publisher import (
     constraint_bijectors,
     publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
 
 __all__ = [
     "ActionBounds",
     "ConstrainedFlowModule",
     "ConstraintBijector",
+    "ConstraintLayer",
     "ConstraintPublisher",
     "ConstraintViolationError",
     "ExactFlow",
@@ -61,8 +65,11 @@ __all__ = [
     "MissingGeometryError",
     "ProjectionFlow",
     "RadialFlow",
+    "RecessionFlow",
     "RelaxedConstraintError",
+    "SafeRandomLatents",
     "SafeRandomPolicy",
+    "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",
     "WarmUpPolicy",

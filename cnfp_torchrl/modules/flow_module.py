@@ -78,8 +78,8 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         bijectors: One `ConstraintBijector` for each constraint.
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
-        flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``radial``,
-            ``squash``, ``projection``, ``unconstrained``.
+        flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``soft``,
+            ``recession``, ``radial``, ``squash``, ``projection``, ``unconstrained``.
         in_keys: The keys of the Gaussian's location and scale, each ``(*batch, d)``.
         out_key: The key of the action, ``(*batch, d)``.
         return_log_prob: Whether to write the action's log-density ``(*batch,)``, too.

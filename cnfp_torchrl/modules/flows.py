@@ -6,20 +6,26 @@ A flow is a small callable, named by `_target_` in ``conf/flow/`` or by its name
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from cnfp_torchrl.bijectors import (
+    SHARPNESS,
     Bijector,
     BoxSquash,
     ExactSquash,
     GaugeSquash,
     Projection,
     RadialSquash,
+    Recession,
+    SoftRetraction,
+    SoftSquash,
     SquashChain,
     paper_squash,
+    require_scale,
+    require_sharpness,
 )
-from cnfp_torchrl.geometry import Ball, ConstraintSet, Region
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, Region
 
 
 class Flow(ABC):
@@ -30,6 +36,12 @@ class Flow(ABC):
 
     reads_constraints: ClassVar[bool] = True
     """Whether the constraints' sets are read."""
+
+    takes_actions: ClassVar[bool] = False
+    """Whether `of_actions` exists: the flow without a squash before it, for wished actions."""
+
+    moves_with_anchor: ClassVar[bool] = True
+    """Whether an anchor moved to an action makes `of_actions` leave that action as it is."""
 
     has_density: ClassVar[bool] = True
     """Whether actions have a log-density; without one, only the reference entropy exists."""
@@ -42,6 +54,21 @@ class Flow(ABC):
             region: The action bounds and the constraints' sets in order of application. A safe flow
                 takes them as relaxed, and its anchor; other flows read the sets alone.
         """
+
+    def of_actions(self, region: Region) -> Bijector:
+        """Return the bijector of wished actions, in action units, which it leaves nearly alone.
+
+        Args:
+            region: As for a call; its bounds may be infinite.
+
+        Raises:
+            TypeError: when the flow squashes all of R^d instead.
+        """
+        raise TypeError(f"{type(self).__name__}: expected a flow that takes wished actions")
+
+    def needs_anchor(self, sets: Sequence[ConstraintSet]) -> bool:
+        """Tell whether `of_actions` needs the anchor of a region of some sets."""
+        return True
 
 
 class RegionFlow(Flow):
@@ -73,6 +100,82 @@ class GaugeFlow(RegionFlow):
     """
 
     squash = GaugeSquash
+
+
+class SoftFlow(RegionFlow):
+    """The exact flow with retractions that leave actions nearly as they are inside the region.
+
+    The retraction of `ExactFlow` shortens a whole ray, although only its end is forbidden; this one
+    shortens its end (`cnfp_torchrl.bijectors.SoftSquash`).
+
+    Args:
+        sharpness: The sharpness p, from 1 to 100. A larger one moves actions less, and puts more of
+            them on the boundary up to rounding.
+        by_components: Whether boxes retract each component by itself, not along the ray.
+    """
+
+    takes_actions = True
+
+    def __init__(self, sharpness: float = SHARPNESS, by_components: bool = True) -> None:
+        self.sharpness = require_sharpness(sharpness)
+        self.by_components = by_components
+
+    def __call__(self, region: Region) -> SoftSquash:
+        return SoftSquash(
+            region,
+            sharpness=self.sharpness,
+            by_components=self.by_components,
+            validate_args=False,
+        )
+
+    def of_actions(self, region: Region) -> SoftRetraction:
+        return SoftRetraction(
+            region,
+            sharpness=self.sharpness,
+            by_components=self.by_components,
+            validate_args=False,
+        )
+
+
+class RecessionFlow(Flow):
+    """A move along a common way out of all half-spaces, then a soft retraction into the rest.
+
+    For barriers that all have a braking direction in common, which it leaves alone where they are
+    far (`cnfp_torchrl.bijectors.Recession`). Where they have none it is a soft retraction alone.
+
+    Args:
+        scale: The scale of its softness: in action units for wished actions, and for a Gaussian
+            policy in units of half the bounds' width.
+        sharpness: The sharpness of the soft retraction, from 1 to 100.
+    """
+
+    is_safe = True
+    takes_actions = True
+    moves_with_anchor = False
+
+    def __init__(self, scale: float = 1.0, sharpness: float = SHARPNESS) -> None:
+        self.scale, self.sharpness = require_scale(scale), require_sharpness(sharpness)
+
+    def __call__(self, region: Region) -> Recession:
+        return self._recession(region, of_latents=True)
+
+    def of_actions(self, region: Region) -> Recession:
+        return self._recession(region, of_latents=False)
+
+    def needs_anchor(self, sets: Sequence[ConstraintSet]) -> bool:
+        bounds, *others = sets
+        assert isinstance(bounds, Box)
+        unbounded = bool((bounds.low.isinf() & bounds.high.isinf()).all())
+        return not (unbounded and all(isinstance(each, HalfSpaces) for each in others))
+
+    def _recession(self, region: Region, *, of_latents: bool) -> Recession:
+        return Recession(
+            region,
+            scale=self.scale,
+            sharpness=self.sharpness,
+            of_latents=of_latents,
+            validate_args=False,
+        )
 
 
 class RadialFlow(RegionFlow):
@@ -148,6 +251,8 @@ class UnconstrainedFlow(Flow):
 FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "gauge": GaugeFlow,
+    "soft": SoftFlow,
+    "recession": RecessionFlow,
     "radial": RadialFlow,
     "squash": SquashFlow,
     "projection": ProjectionFlow,

@@ -7,9 +7,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.keys import LATENT_KEY
 from cnfp_torchrl.modules.actors import flow_head
+from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
+from cnfp_torchrl.modules.latent import FlowMap
 
 
 class SafeRandomPolicy(TensorDictModuleBase):
@@ -36,6 +40,30 @@ class SafeRandomPolicy(TensorDictModuleBase):
         return self.head.random(tensordict)
 
 
+class SafeRandomLatents(TensorDictModuleBase):
+    """Draw latents of standard Gaussian noise, and write them beside the actions that they become.
+
+    Args:
+        head: The flow module of a constrained actor (`flow_head`).
+        latent_key: The key of the latents ``(*batch, d)``.
+    """
+
+    def __init__(self, head: ConstrainedFlowModule, latent_key: NestedKey = LATENT_KEY) -> None:
+        super().__init__()
+        self.map = FlowMap(head, latent_key)
+        self.in_keys = head.geometry_keys()
+        self.out_keys = [latent_key, head.action_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write a latent and its action for every batch element."""
+        head = self.map.head
+        like = tensordict.get(self.in_keys[0]) if self.in_keys else head.bounds.low
+        device = like.device if tensordict.device is None else tensordict.device
+        shape = (*tensordict.shape, head.action_dim)
+        latent = torch.randn(shape, dtype=head.action_dtype, device=device)
+        return self.map(tensordict.set(self.map.latent_key, latent))
+
+
 class WarmUpPolicy(TensorDictModuleBase):
     """Act at random, within the constraints, for a number of frames, then with the actor.
 
@@ -47,14 +75,21 @@ class WarmUpPolicy(TensorDictModuleBase):
     Args:
         actor: A constrained actor.
         frames: The number of actions, over all batch elements, before the actor takes over.
+        random: The random policy; None takes `SafeRandomPolicy(actor)`. A policy of
+            `split_at_latent` needs ``SafeRandomLatents(flow_head(ACTOR))``.
     """
 
-    def __init__(self, actor: SafeProbabilisticTensorDictSequential, frames: int) -> None:
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        frames: int,
+        random: TensorDictModuleBase | None = None,
+    ) -> None:
         super().__init__()
         if frames < 0:
             raise ValueError(f"frames: expected a number >= 0, given {frames}")
         self.actor = actor
-        self.random = SafeRandomPolicy(actor)
+        self.random = SafeRandomPolicy(actor) if random is None else random
         # Not an int, for each value of which a compiled policy would be compiled anew. On the host,
         # where reading it does not wait for an accelerator.
         self._frames_left = torch.tensor(frames)

@@ -1,8 +1,18 @@
 """Losses that TorchRL lacks."""
 
 from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
-from cnfp_torchrl.objectives.sac import ConstrainedSACLoss
+from cnfp_torchrl.objectives.ppo import ConstrainedPPOLoss
+from cnfp_torchrl.objectives.sac import ConstrainedSACLoss, usual_target_entropy
 from cnfp_torchrl.objectives.sac_lagrangian import SACLagrangianLoss
 from cnfp_torchrl.objectives.soft_update import FusedSoftUpdate
+from cnfp_torchrl.objectives.td3 import ConstrainedTD3Loss
 
-__all__ = ["BatchedSACLoss", "ConstrainedSACLoss", "FusedSoftUpdate", "SACLagrangianLoss"]
+__all__ = [
+    "BatchedSACLoss",
+    "ConstrainedPPOLoss",
+    "ConstrainedSACLoss",
+    "ConstrainedTD3Loss",
+    "FusedSoftUpdate",
+    "SACLagrangianLoss",
+    "usual_target_entropy",
+]

@@ -8,15 +8,14 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 from torchrl.objectives import ValueEstimators
 
+from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     actor_modules,
-    has_density,
     with_reference_entropy,
 )
 from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
-
-Entropy = Literal["reference", "action"]
+from cnfp_torchrl.objectives.requirements import Entropy, require_discount, require_entropy
 
 
 class ConstrainedSACLoss(BatchedSACLoss):
@@ -37,12 +36,14 @@ class ConstrainedSACLoss(BatchedSACLoss):
         max_alpha: The largest weight of the entropy. Where a constraint is relaxed, the allowed
             region is as thin as the leeway, and no policy has the target entropy of its actions
             there: the weight would grow without end, and the gradients with it.
+        target_entropy: The entropy that its weight is adapted to, in nats. ``auto`` takes
+            `usual_target_entropy` of the action bounds: the reference entropy can have it whatever
+            the flow and however small the allowed region, the action's entropy cannot.
         kwargs: Further options of `torchrl.objectives.SACLoss`.
 
     Raises:
-        ValueError: for an unknown entropy, for ``action`` where actions have no density, for a
-            discount outside [0, 1), and for a batched spec where the target entropy -d is to be
-            read from it.
+        ValueError: for an unknown entropy, for ``action`` where actions have no density, and for a
+            discount outside [0, 1).
     """
 
     def __init__(
@@ -53,32 +54,29 @@ class ConstrainedSACLoss(BatchedSACLoss):
         entropy: Entropy = "reference",
         gamma: float = 0.99,
         max_alpha: float = 10.0,
+        target_entropy: float | Literal["auto"] = "auto",
         **kwargs: Any,
     ) -> None:
-        if entropy not in ("reference", "action"):
-            raise ValueError(f"entropy: expected 'reference' or 'action', given {entropy!r}")
-        if not 0 <= gamma < 1:
-            raise ValueError(f"gamma: expected a discount in [0, 1), given {gamma}")
-        if entropy == "action" and not has_density(actor_network):
-            raise ValueError(
-                "entropy: expected 'reference' for an actor whose actions have no density, such as "
-                f"one that projects them, given {entropy!r}"
-            )
+        require_entropy(entropy, actor_network)
+        require_discount(gamma)
         scored = with_reference_entropy(actor_network) if entropy == "reference" else actor_network
-        super().__init__(scored, qvalue_network, max_alpha=max_alpha, **kwargs)
         head = actor_modules(actor_network)[-1]
-        if kwargs.get("target_entropy", "auto") == "auto" and isinstance(
-            head, ConstrainedFlowModule
-        ):
-            self._require_target_entropy(head.action_dim)
+        if target_entropy == "auto" and isinstance(head, ConstrainedFlowModule):
+            target_entropy = usual_target_entropy(head.bounds)
+        super().__init__(
+            scored, qvalue_network, max_alpha=max_alpha, target_entropy=target_entropy, **kwargs
+        )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
 
-    def _require_target_entropy(self, action_dim: int) -> None:
-        # SACLoss counts the numbers of the spec, those of all batch elements of a batched one.
-        counted = -round(float(self.target_entropy))
-        if counted != action_dim:
-            raise ValueError(
-                f"action_spec: expected that of one action, with {action_dim} components, given "
-                f"one with {counted}, which would make the target entropy {-counted} in place of "
-                f"{-action_dim}; pass action_spec=env.action_spec_unbatched"
-            )
+
+def usual_target_entropy(bounds: Box) -> float:
+    r"""Return the target entropy of SAC for actions within bounds.
+
+    It is :math:`-d + \sum_i \log((b_i - a_i) / 2)`: the usual -d for bounds of -1 and 1, and for
+    others as much below the entropy of the uniform distribution, whatever units the actions have.
+
+    Args:
+        bounds: The action bounds :math:`a, b`, ``(d,)``.
+    """
+    half_widths = (bounds.high.double() - bounds.low.double()) / 2
+    return float(half_widths.log().sum()) - bounds.dim

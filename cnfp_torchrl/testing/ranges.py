@@ -86,8 +86,10 @@ def _valid(sets: ConstraintSet) -> Tensor:
     valid = torch.ones(sets.batch_shape, dtype=torch.bool, device=like.device)
     tiny, most = torch.finfo(sets.dtype).tiny, largest_value(sets.dtype)
     bad = [mask for _, mask, _ in sets.invalid_fields()]
-    for value in sets.fields().values():
+    for field, value in sets.fields().items():
         size = value.abs()
+        if field in sets.finite_fields:
+            bad.append(size.isinf())
         # Scaling to infinity or to a subnormal number has changed the set, not its size.
         bad += [size.isfinite() & (size > most), (size > 0) & (size < tiny), value.isnan()]
     for mask in bad:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
+from torchrl.objectives import LossModule
 
 from cnfp_torchrl.envs import (
     GeometryTransform,
@@ -24,7 +27,7 @@ from cnfp_torchrl.modules import (
     publishes_constraints,
     require_fit,
 )
-from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
+from cnfp_torchrl.objectives import SACLagrangianLoss
 from cnfp_torchrl.training.run_folder import RunFolder
 
 
@@ -32,6 +35,7 @@ def build_environment(
     config: DictConfig,
     *,
     batch_size: list[int] | None = None,
+    device: torch.device | str | None = None,
     with_anchor: bool = False,
     with_penalty: bool = False,
 ) -> TransformedEnv:
@@ -40,6 +44,8 @@ def build_environment(
     Args:
         config: configuration with the sections ``env`` and ``flow``.
         batch_size: batch size of environments that have one; None takes that of the configuration.
+        device: device of the environment, and of the actor and the critics made for it; None leaves
+            it where it is.
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
@@ -52,6 +58,8 @@ def build_environment(
     if replaced and isinstance(bare, ParallelEnv):
         base.close()  # each of its environments is a process: no more of them than in training
         base = instantiate(config.env.base, _convert_="all")
+    if device is not None:
+        base = base.to(device)
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
     view = instantiate(config.env.get("view"), _convert_="all")
     if view is not None:
@@ -100,10 +108,16 @@ def build_actor(config: DictConfig, env: TransformedEnv) -> SafeProbabilisticTen
         ValueError: when its network does not fit the environment.
     """
     flow: Flow = instantiate(config.flow)
-    network = instantiate(config.network.actor, *_sizes(env))
+    network = _made(config.network.actor, env)
     if flow.reads_constraints or publishes_constraints(env):
         return make_constrained_actor(network, env, flow=flow)
     return make_constrained_actor(network, bijectors=[], spec=env.action_spec_unbatched, flow=flow)
+
+
+def _made(section: DictConfig, env: TransformedEnv, *sizes: int) -> Any:
+    """Return a network of a configuration, on the environment's device."""
+    network = instantiate(section, *_sizes(env), *sizes)
+    return network if env.device is None else network.to(env.device)
 
 
 def _sizes(env: TransformedEnv) -> tuple[int, int]:
@@ -125,31 +139,51 @@ def _sizes(env: TransformedEnv) -> tuple[int, int]:
 
 def build_critic(config: DictConfig, env: TransformedEnv) -> ValueOperator:
     """Return the critic of a configuration for an environment."""
-    critic = instantiate(config.network.critic, *_sizes(env))
+    critic = _made(config.network.critic, env)
     require_fit("network.critic", critic, env, critic.out_keys[-1:], 1)
     return critic
+
+
+def _require_output(critic: TensorDictModule, key: NestedKey) -> None:
+    """Refuse a critic that writes another entry than a loss reads.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if key not in critic.out_keys:
+        raise ValueError(
+            f"network.critic: expected one that writes {key!r}, as the loss reads it, given one "
+            f"that writes {critic.out_keys}; algorithm=sac, td3 and ppo bring networks that fit"
+        )
 
 
 def build_cost_critic(config: DictConfig, env: TransformedEnv) -> TensorDictModule:
     """Return the critic of the costs that an environment counts."""
     constraints = len(counted_constraints(env))
-    critic = instantiate(config.network.cost_critic, *_sizes(env), constraints)
+    critic = _made(config.network.cost_critic, env, constraints)
     require_fit("network.cost_critic", critic, env, critic.out_keys[-1:], constraints)
     return critic
 
 
 def build_loss(
     config: DictConfig, env: TransformedEnv, actor: SafeProbabilisticTensorDictSequential
-) -> ConstrainedSACLoss:
+) -> LossModule:
     """Return the loss of a configuration, with critics of its own for the actor.
 
     Raises:
         ValueError: when the loss needs costs and the environment counts none.
     """
     make = instantiate(config.loss, _partial_=True)
-    networks: list[TensorDictModule] = [actor, build_critic(config, env)]
-    options: dict[str, Any] = {"action_spec": env.action_spec_unbatched}
-    if isinstance(make.func, type) and issubclass(make.func, SACLagrangianLoss):
+    critic = build_critic(config, env)
+    networks: list[TensorDictModule] = [actor, critic]
+    kind = make.func
+    default_keys: Any = getattr(kind, "default_keys", None)
+    if default_keys is not None:
+        keys = default_keys()
+        is_of_states = not hasattr(keys, "state_action_value")
+        _require_output(critic, keys.value if is_of_states else keys.state_action_value)
+    options: dict[str, Any] = {}
+    if isinstance(kind, type) and issubclass(kind, SACLagrangianLoss):
         options["constraint_names"] = counted_constraints(env)
         if not options["constraint_names"]:
             raise ValueError(

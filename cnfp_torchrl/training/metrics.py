@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.record.loggers import Logger, TensorboardLogger
+from torchrl.record.loggers import Logger, TensorboardLogger, WandbLogger
 from tqdm import tqdm
 
 from cnfp_torchrl.training.constraint_counts import (
@@ -117,6 +117,20 @@ class Metrics:
         for name, value in losses.items():
             self._losses[name].append(value.detach())
 
+    def add_evaluation(self, report: Mapping[str, Any]) -> None:
+        """Write an evaluation into the log, together with an entry of training.
+
+        Args:
+            report: its ``return_mean``, ``score`` and ``violations``.
+        """
+        self.finish()  # so that what is logged up to here is what a resumed run keeps
+        self._log("evaluation/return", report["return_mean"])
+        if report["score"] is not None:
+            self._log("evaluation/score", report["score"])
+        for name, count in report["violations"].items():
+            if count is not None:
+                self._log(f"evaluation/violations_{name}", count)
+
     def log_if_due(self) -> None:
         """Write an entry of the log when the interval has passed.
 
@@ -140,8 +154,9 @@ class Metrics:
         """Finish the progress bar and end what the loggers started."""
         self._bar.close()
         for logger in self._loggers:
-            if isinstance(logger, TensorboardLogger):
-                logger.close()  # ends its thread, which would outlive the run
+            # Their threads and processes would outlive the run.
+            if isinstance(logger, TensorboardLogger | WandbLogger):
+                logger.close()
 
     def _log_entry(self) -> None:
         self._logged_at = self.frames

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor, nn
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 
 
@@ -35,6 +36,65 @@ def gaussian_network(
         ),
         NormalParamExtractor(scale_mapping=scale_mapping, scale_lb=scale_lb),
     )
+
+
+class LatentLocation(nn.Module):
+    """The end of a deterministic network: a location within reach, and a scale that is not learned.
+
+    Beyond a few units of the latent an action hardly changes, so that a location without bounds
+    would run away from where it has gradients.
+
+    Args:
+        noise: the scale, that of exploration, in units of the latent.
+        reach: the largest absolute value of a location.
+    """
+
+    def __init__(self, noise: float, reach: float) -> None:
+        super().__init__()
+        self.noise, self.reach = noise, reach
+
+    def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Return location and scale, ``(*batch, d)`` each."""
+        return self.reach * torch.tanh(output / self.reach), torch.full_like(output, self.noise)
+
+
+def deterministic_network(
+    observation_size: int,
+    action_size: int,
+    *,
+    hidden: Sequence[int] = (256, 256),
+    noise: float = 0.3,
+    reach: float = 3.0,
+) -> nn.Module:
+    """Return a network from observations to a latent, with a fixed scale of exploration.
+
+    Args:
+        observation_size: number of observed numbers.
+        action_size: number d of action components.
+        hidden: widths of the hidden layers.
+        noise: scale of exploration, in units of the latent.
+        reach: largest absolute value of a latent without noise.
+    """
+    network = MLP(
+        in_features=observation_size,
+        out_features=action_size,
+        num_cells=list(hidden),
+        activation_class=nn.ReLU,
+    )
+    return nn.Sequential(network, LatentLocation(noise, reach))
+
+
+def state_value_network(
+    observation_size: int, action_size: int, *, hidden: Sequence[int] = (256, 256)
+) -> ValueOperator:
+    """Return a critic of ``observation`` alone that writes ``state_value``."""
+    network = MLP(
+        in_features=observation_size,
+        out_features=1,
+        num_cells=list(hidden),
+        activation_class=nn.Tanh,
+    )
+    return ValueOperator(network, in_keys=["observation"])
 
 
 def action_value_network(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pickle
 import shlex
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted,
 from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
+FAILURE = "failure.json"
 BEST = "best.pt"
 """The policy of the best score in training, in the form of the last one's `CHECKPOINT`."""
 STATES = "checkpoints"
@@ -30,10 +33,12 @@ class RunFolder:
 
     Args:
         path: the folder.
+        checkpoint: name of the file that policies are read from.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
         self.path = Path(path)
+        self.checkpoint = checkpoint
         self._release: Callable[[], Any] | None = None
 
     def close(self) -> None:
@@ -115,17 +120,21 @@ class RunFolder:
         return (self.path / SUMMARY).is_file()
 
     @classmethod
-    def open(cls, path: str | Path) -> RunFolder:
+    def open(cls, path: str | Path, checkpoint: str = CHECKPOINT) -> RunFolder:
         """Return the folder of a finished run.
+
+        Args:
+            path: the folder.
+            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
         """
-        folder = cls(path)
-        missing = [n for n in (CONFIG, CHECKPOINT) if not (folder.path / n).is_file()]
+        folder = cls(path, checkpoint)
+        missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
         if missing:
             raise FileNotFoundError(
-                f"run: expected the folder of a finished run with {CONFIG} and {CHECKPOINT}, but "
+                f"run: expected the folder of a finished run with {CONFIG} and {checkpoint}, but "
                 f"{folder.path} lacks {missing}; give the folder that training printed when it "
                 f"ended, finish the run with cnfp-train resume={folder.path}, or train again"
             )
@@ -219,7 +228,7 @@ class RunFolder:
         Raises:
             ValueError: when there is none, or it is not a whole checkpoint.
         """
-        path = self.path / CHECKPOINT
+        path = self.path / self.checkpoint
         if not path.is_file():
             raise self._unusable("is not there")
         if not path.stat().st_size:
@@ -253,7 +262,7 @@ class RunFolder:
     def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
         reason = "" if error is None else f" ({type(error).__name__}: {error})"
         return ValueError(
-            f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
+            f"{self.path / self.checkpoint}: expected the checkpoint that training wrote beside "
             f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
         )
@@ -272,6 +281,21 @@ class RunFolder:
             f"stopped and saved at step {frames}; go on with: "
             f"cnfp-train resume={shlex.quote(str(self.path))}"
         )
+
+    def save_failure(self, error: BaseException) -> None:
+        """Write why the run failed, as far as that can be written."""
+        with suppress(OSError):
+            write_json(self.path / FAILURE, {"reason": f"{type(error).__name__}: {error}"})
+
+    def load_failure(self) -> str | None:
+        """Return why the run failed; None where it has not."""
+        if not (self.path / FAILURE).is_file():
+            return None
+        return str(json.loads((self.path / FAILURE).read_text(encoding="utf-8"))["reason"])
+
+    def forget_failure(self) -> None:
+        """Remove what `save_failure` wrote, for a run that is tried again."""
+        (self.path / FAILURE).unlink(missing_ok=True)
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write the summary."""

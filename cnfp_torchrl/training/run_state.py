@@ -137,6 +137,20 @@ class BestPolicy:
             violations: all violations so far; those since the last offer count.
         """
         is_clean, self.violations = violations == self.violations, violations
-        if is_clean and score > self.score:
+        if is_clean:
+            self._keep_if_better(score)
+
+    def offer_evaluation(self, report: Mapping[str, Any]) -> None:
+        """Keep the policy if an evaluation during training says that it is better, and clean.
+
+        Args:
+            report: the evaluation's ``return_mean``, ``score`` and ``violations``.
+        """
+        if not any(report["violations"].values()):
+            score = report["return_mean"] if report["score"] is None else report["score"]
+            self._keep_if_better(score)
+
+    def _keep_if_better(self, score: float) -> None:
+        if score > self.score:
             self._folder.save_checkpoint(BEST, **self._modules)
             self.score = score

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -59,9 +59,12 @@ class EvaluationSettings:
     """Number and seed of the episodes that policies are judged by.
 
     Args:
-        episodes: number of whole episodes for each policy.
+        episodes: number of whole episodes for each policy, after training.
         seed: seed of the environment and of what policies draw, the same for all of them.
         max_steps: length at which an episode is cut off, for environments that never end one.
+        interval: environment steps of training between two evaluations; None evaluates only after.
+        interval_episodes: number of whole episodes of each evaluation during training, at most
+            `episodes`.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -70,9 +73,15 @@ class EvaluationSettings:
     episodes: int = 400
     seed: int = 1000
     max_steps: int = 1000
+    interval: int | None = None
+    interval_episodes: int = 32
 
     def __post_init__(self) -> None:
         require_fields("evaluation", self)
+
+    def at_interval(self) -> EvaluationSettings:
+        """Return the settings of the evaluations during training."""
+        return replace(self, episodes=min(self.interval_episodes, self.episodes))
 
 
 def require_frames(config: DictConfig) -> None:

@@ -7,21 +7,21 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.checkpoint import GlobalRNGState
+from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.configuration import require_settings
-from cnfp_torchrl.keys import COST_KEY
-from cnfp_torchrl.modules import WarmUpPolicy, flow_head, guarded
+from cnfp_torchrl.modules import flow_head, guarded
 from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
-    build_loss,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -39,6 +39,8 @@ from cnfp_torchrl.training.constraint_counts import (
 from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBeginAnewWarning
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
 from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
+from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
@@ -48,9 +50,6 @@ from cnfp_torchrl.training.settings import (
     TrainingSettings,
     require_frames,
 )
-from cnfp_torchrl.training.storage import prepare_buffer
-from cnfp_torchrl.training.stored_transitions import StoredTransitions
-from cnfp_torchrl.training.update import Update, UpdateBudget
 
 _log = logging.getLogger(__name__)
 
@@ -87,32 +86,17 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.threads)
 
-    # Environment, actor and loss
-    env = build_environment(config, with_penalty=True)
+    # Environment, actor, algorithm and collector
+    env = build_environment(config, device=config.device, with_penalty=True)
     env.set_seed(config.seed)
     tally = ConstraintTally.of(env)
     actor = build_actor(config, env)
-    loss = build_loss(config, env, actor)
-    target = instantiate(config.target, _partial_=True)(loss)
-    optimizer = instantiate(config.optim, _partial_=True)(loss.parameters())
-    update = Update(loss, optimizer, target, compiled=config.compile)
-
-    # Collector and replay buffer
-    policy = WarmUpPolicy(actor, settings.warmup_frames)
-    if config.compile:
-        # Not the policy around it, which counts: a number that changes would be compiled anew.
-        policy.actor = torch.compile(actor)
-    collector = instantiate(config.collector, _partial_=True)(env, policy)
-    # A collector tries its policy once when it is made, which is not a step of the warm-up.
-    policy.frames_left = settings.warmup_frames
-    buffer = instantiate(config.replay_buffer)
-    stored = prepare_buffer(
-        buffer,
-        env,
-        actor.in_keys,
-        other_keys=[key for key in [("next", COST_KEY)] if key in loss.in_keys],
-        constraint_bytes=settings.constraint_bytes,
+    is_saved = saving.interval is not None
+    learner: Learner = instantiate(config.algorithm, _partial_=True)(
+        config, env, actor, folder.path / STATES if is_saved else None
     )
+    collector = instantiate(config.collector, _partial_=True)(env, learner.policy)
+    learner.begin()
 
     # Callback and loggers
     state = RunState(folder, saving)
@@ -144,24 +128,26 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     )
 
     # What the run goes on from
-    is_saved = saving.interval is not None
-    transitions = StoredTransitions(buffer, folder.path / STATES, is_saved=is_saved)
-    budget = UpdateBudget(settings.update_ratio)
-    best = BestPolicy(folder, actor=actor, loss=loss, optimizer=optimizer)
+    trained = {"actor": actor, "loss": learner.loss, "optimizer": learner.optimizer}
+    best = BestPolicy(folder, **trained)
     episodes = CollectorState(collector, env)
+    evaluations = IntervalEvaluation(
+        partial(_evaluation_environment, config, evaluation.at_interval().episodes),
+        actor,
+        evaluation,
+        score,
+    )
     state.restore(
         {
-            "actor": actor,
-            "loss": loss,
-            "optimizer": optimizer,
-            "warm_up": Attributes(policy, "frames_left"),
-            "budget": Attributes(budget, "due"),
+            **trained,
+            **learner.components(),
             "best": Attributes(best, "score", "violations"),
+            "evaluations": Attributes(evaluations, "history"),
             "metrics": metrics,
             "collector": episodes,
             "random": GlobalRNGState(),
         },
-        transitions,
+        learner.transitions,
     )
     if resume:
         callback.continue_at(metrics.frames)
@@ -174,32 +160,33 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 stacklevel=3,
             )
 
-    with closing(callback):
+    with closing(callback), closing(evaluations):
         with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
             for collected in collector:
                 callback.on_batch(collected)
-                batch = collected.reshape(-1)
-                metrics.add_steps(batch)
-                transitions.extend(batch.select(*stored))
-                if metrics.frames >= settings.warmup_frames:
-                    budget.earn(batch.numel())
-                    while budget.spend():
-                        metrics.add_losses(update(buffer.sample()))
+                metrics.add_steps(collected.reshape(-1))
+                for losses in learner.learn(collected, metrics.frames):
+                    metrics.add_losses(losses)
                 metrics.log_if_due()
                 is_last = metrics.frames >= config.collector.total_frames
+                if (report := evaluations.run_if_due(metrics.frames, is_last)) is not None:
+                    metrics.add_evaluation(report)
+                    best.offer_evaluation(report)
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
-                    best.offer(*_training_score(metrics, score))
+                    if evaluation.interval is None:
+                        best.offer(*_training_score(metrics, score))
                     state.save(metrics.frames)
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
             metrics.finish()
         collector.shutdown()
         # Before anything else that may fail or be interrupted.
-        folder.save_checkpoint(actor=actor, loss=loss, optimizer=optimizer)
+        folder.save_checkpoint(**trained)
 
         # Evaluation
         summary = {
             **_results(metrics, _evaluations(config, actor, evaluation), score),
+            "evaluations_in_training": evaluations.history,
             "steps": metrics.frames,
             "seconds": metrics.seconds,
             "flow": type(flow_head(actor).flow).__name__,
@@ -210,7 +197,9 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
         state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
         if visual is not None:
-            with closing(build_environment(config, batch_size=[1], with_anchor=True)) as one:
+            with closing(
+                build_environment(config, batch_size=[1], device=config.device, with_anchor=True)
+            ) as one:
                 give_episodes(callback, visual, evaluation, one, actor)
     return summary
 
@@ -238,6 +227,11 @@ def _training_score(metrics: Metrics, score: LinearScore | None) -> tuple[float,
     return last if score is None else score(last), violations
 
 
+def _evaluation_environment(config: DictConfig, episodes: int) -> TransformedEnv:
+    """Return an environment for some episodes, without a penalty, on the device of training."""
+    return build_environment(config, batch_size=[episodes], device=config.device)
+
+
 def _evaluations(
     config: DictConfig,
     actor: SafeProbabilisticTensorDictSequential,
@@ -250,7 +244,7 @@ def _evaluations(
         actor: the trained actor.
         settings: number of episodes and the seed.
     """
-    with closing(build_environment(config, batch_size=[settings.episodes])) as env:
+    with closing(_evaluation_environment(config, settings.episodes)) as env:
         return {
             name: evaluate_seeded(env, guarded(actor), settings, deterministic=deterministic)
             for name, deterministic in {"stochastic": False, "deterministic": True}.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
@@ -39,7 +40,10 @@ class Update:
     Args:
         loss: the loss; its outputs named ``loss_...`` are summed and descended.
         optimizer: optimizer of the loss's parameters.
-        target: updater of the loss's target networks, called after each step.
+        target: updater of the loss's target networks, if it has any, called after each step.
+        actor_every: number of steps of the critics for one of actor and targets; more than 1 needs
+            a loss with a ``critic_loss`` of its own, such as `ConstrainedTD3Loss`.
+        max_grad_norm: largest norm of the gradient, which is shortened to it; None leaves it.
         compiled: compile the loss and its backward pass, which takes a minute or more, once.
     """
 
@@ -47,20 +51,31 @@ class Update:
         self,
         loss: LossModule,
         optimizer: Optimizer,
-        target: TargetNetUpdater,
+        target: TargetNetUpdater | None = None,
         *,
+        actor_every: int = 1,
+        max_grad_norm: float | None = None,
         compiled: bool = False,
     ) -> None:
         self.loss = loss
         self.optimizer = optimizer
         self.target = target
+        self.count = 0
+        """The number of steps so far."""
+        self._actor_every, self._max_grad_norm = actor_every, max_grad_norm
         self._losses = torch.compile(loss) if compiled else loss
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Make one step and return what the loss returned."""
-        losses = self._losses(batch)
-        self.optimizer.zero_grad()
+        self.count += 1
+        is_whole = self.count % self._actor_every == 0
+        losses = self._losses(batch) if is_whole else self.loss.critic_loss(batch)
+        # Parameters without a gradient, such as the actor's in between, stay as they are.
+        self.optimizer.zero_grad(set_to_none=True)
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        if self._max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(self.loss.parameters(), self._max_grad_norm)
         self.optimizer.step()
-        self.target.step()
+        if self.target is not None and is_whole:
+            self.target.step()
         return losses

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 
 import torch
 from mpmath import mpf
@@ -17,7 +17,10 @@ from cnfp_torchrl.bijectors import (
     ExactSquash,
     GaugeSquash,
     RadialSquash,
+    Recession,
     Retraction,
+    SoftRetraction,
+    SoftSquash,
     SquashChain,
     paper_squash,
 )
@@ -40,6 +43,9 @@ FLOWS = {
     "gauge": reference.gauge_squash,
     "radial": reference.radial_squash,
     "retraction": reference.gauge_squash,
+    "soft": partial(reference.soft_squash, sharpness=2, by_components=True),
+    "soft-rays": partial(reference.soft_squash, sharpness=4, by_components=False),
+    "soft-alone": partial(reference.soft_retraction, sharpness=2),
 }
 DTYPES = (torch.float32, torch.float64)
 
@@ -50,7 +56,8 @@ class Case:
 
     Args:
         name: for the test's id.
-        kind: squash, chain (the paper's), aligned, gauge, radial or retraction.
+        kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft, soft-rays,
+            soft-alone or recession.
         sets: in order of application, float64 of values that float32 holds too.
         anchor: of the kinds that have one, ``(*batch, d)``.
         active: which sets hold, ``(*batch, len(sets))``; None means all.
@@ -94,6 +101,17 @@ class Case:
         slack = self.region(torch.float64).slack(self.anchor).min()
         return max([self.size, *sizes]) / float(slack)
 
+    @property
+    def saturates(self) -> bool:
+        """Whether the slope far from the anchor is below rounding error, by design."""
+        return self.kind.startswith(("soft", "recession"))
+
+    @property
+    def cancellation(self) -> float:
+        """The rounding error of a slope from autograd, which is a difference where it saturates."""
+        # Of sharpness 2: the slope is the small difference of two terms, larger by divisor^2.
+        return 4 * 2.0**-52 * self.tightness**2 if self.saturates else 0.0
+
     def cast(self, dtype: torch.dtype) -> tuple[ConstraintSet, ...]:
         return tuple(cast(each, dtype) for each in self.sets)
 
@@ -113,6 +131,14 @@ class Case:
                 return GaugeSquash(self.region(dtype))
             case "radial":
                 return RadialSquash(self.region(dtype))
+            case "recession":
+                return Recession(self.region(dtype), of_latents=True)
+            case "soft":
+                return SoftSquash(self.region(dtype))
+            case "soft-rays":
+                return SoftSquash(self.region(dtype), sharpness=4, by_components=False)
+            case "soft-alone":
+                return SoftRetraction(self.region(dtype))
             case "retraction":
                 outer, inner = self.cast(dtype)
                 assert isinstance(outer, Box)
@@ -464,6 +490,22 @@ def exact_flows() -> tuple[Case, ...]:
         boxes = all(isinstance(each, Box) for each in sets)
         found.append(Case(f"aligned-{name}", "aligned", sets, anchor, active, smooth=boxes))
         found.append(Case(f"radial-{name}", "radial", sets, anchor, active))
+        found.append(Case(f"soft-{name}", "soft", sets, anchor, active))
+    for name in (
+        *("ball-d1", "box-ball-d2", "half-spaces-l1-d2", "all-families-d3-batch"),
+        "dropped-d3-batch",
+    ):
+        found.append(Case(f"soft-rays-{name}", "soft-rays", *regions()[name]))
+    for name in (
+        *("half-spaces-ball-d1-batch", "half-spaces-l1-d2", "far-d2", "all-families-d3-batch"),
+        *("tight-d2-batch", "mixed-batches-d3"),
+    ):
+        found.append(Case(f"recession-{name}", "recession", *regions()[name]))
+    for name in (
+        *("bounds-d1", "bounds-d2", "box-ball-d2", "open-box-d2", "half-spaces-l1-d2"),
+        *("dropped-d3-batch", "large-d32"),
+    ):
+        found.append(Case(f"soft-alone-{name}", "soft-alone", *regions()[name]))
     plane, many = Maker(2, seed=40), Maker(6, (3,), slack=0.05, seed=41)
     tight = Maker(3, (5,), slack=1e-4, seed=42)
     found += [

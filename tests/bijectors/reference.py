@@ -195,6 +195,70 @@ def aligned_squash(
     return along(c, offset, share), log_det + len(latent) * mp.log(share)
 
 
+def soft_squash(
+    sets: Sequence[ConstraintSet],
+    anchor: Tensor,
+    latent: Vector,
+    *,
+    sharpness: int,
+    by_components: bool,
+) -> tuple[Vector, mpf]:
+    """Squash into the bounds, then retract softly: boxes by components, other sets along rays."""
+    bounds, c = sets[0], to_mp(anchor)
+    assert isinstance(bounds, Box)
+    bounded, log_det = box_squash(bounds, latent)
+    offset = [x - y for x, y in zip(bounded, c, strict=True)]
+    boxes = [each for each in sets if isinstance(each, Box)] if by_components else [bounds]
+    rest = [each for each in sets[1:] if not any(each is box for box in boxes)]
+    inner = merged(boxes)
+    offset, change = soft_components(bounds, inner, c, offset, sharpness)
+    log_det += change
+    point, change = soft_ray(exit_along(c, offset, [inner]), [inner, *rest], c, offset, sharpness)
+    return point, log_det + change
+
+
+def soft_retraction(
+    sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector, *, sharpness: int
+) -> tuple[Vector, mpf]:
+    """Retract R^d softly: bounds and boxes by components, other sets along rays."""
+    c = to_mp(anchor)
+    offset = [x - y for x, y in zip(latent, c, strict=True)]
+    inner = merged([each for each in sets if isinstance(each, Box)])
+    rest = [each for each in sets if not isinstance(each, Box)]
+    offset, log_det = soft_components(None, inner, c, offset, sharpness)
+    point, change = soft_ray(exit_along(c, offset, [inner]), [inner, *rest], c, offset, sharpness)
+    return point, log_det + change
+
+
+def merged(boxes: Sequence[Box]) -> Box:
+    low, high = boxes[0].low, boxes[0].high
+    for box in boxes[1:]:
+        low, high = low.maximum(box.low), high.minimum(box.high)
+    return Box(low, high)
+
+
+def soft_components(
+    outer: Box | None, inner: Box, c: Vector, offset: Vector, sharpness: int
+) -> tuple[Vector, mpf]:
+    moved, log_det = [], mpf(0)
+    for i, v in enumerate(offset):
+        ends = [(to_mp(b.high if v > 0 else b.low)[i] - c[i]) for b in (inner, outer) if b]
+        inverse = [abs(v / end) ** sharpness for end in ends]
+        u = 1 + inverse[0] - (inverse[1] if outer else 0)
+        moved.append(v * u ** (-mpf(1) / sharpness))
+        log_det -= (1 + mpf(1) / sharpness) * mp.log(u)
+    return moved, log_det
+
+
+def soft_ray(
+    whole: mpf, sets: Sequence[ConstraintSet], c: Vector, offset: Vector, sharpness: int
+) -> tuple[Vector, mpf]:
+    """Retract along a ray that leaves the outer set after a multiple of the offset."""
+    u = 1 + exit_along(c, offset, sets) ** -sharpness - whole**-sharpness
+    share = u ** (-mpf(1) / sharpness)
+    return along(c, offset, share), -(mpf(len(offset)) / sharpness + 1) * mp.log(u)
+
+
 def radial_squash(
     sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:

@@ -28,7 +28,9 @@ def test_inverse_undoes_forward(case: Case, dtype: torch.dtype) -> None:
     moved = eps * (1 + case.size * torch.linalg.matrix_norm(inverse, 2))
     # Where float32 hardly resolves the latent, the map is not linear over its error any more.
     resolved = moved < 0.05
-    assert resolved.double().mean() > (0.3 if dtype == torch.float32 else 0.99)
+    # What the soft retractions promise is in test_soft_retraction.
+    if not case.saturates:
+        assert resolved.double().mean() > (0.3 if dtype == torch.float32 else 0.99)
 
     assert bijector.contains(action)[resolved].all()
     assert ((found - z).abs().amax(-1) <= moved)[resolved].all()

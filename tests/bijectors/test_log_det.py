@@ -11,10 +11,16 @@ from tests.bijectors.cases import CASES, Case, latents
 from tests.bijectors.numeric import log_abs_det
 
 ids = {"ids": lambda case: case.name}
-WITH_REFERENCE = [case for case in CASES if "visible" not in case.name]
+# The recession is compared with mpmath in test_recession.
+WITHOUT_REFERENCE = ("visible", "recession")
+WITH_REFERENCE = [case for case in CASES if not any(n in case.name for n in WITHOUT_REFERENCE)]
 
 
-@pytest.mark.parametrize("case", CASES, **ids)
+# Far beyond the rows the recession's slope vanishes beside 1, which autograd subtracts it from.
+BY_AUTOGRAD = [case for case in CASES if case.kind != "recession"]
+
+
+@pytest.mark.parametrize("case", BY_AUTOGRAD, **ids)
 def test_log_det_is_that_of_the_jacobian(case: Case) -> None:
     bijector = case.build(torch.float64)
     lengths = (0.05, 0.5, 2.0, 5.0, 8.0)
@@ -22,7 +28,7 @@ def test_log_det_is_that_of_the_jacobian(case: Case) -> None:
     action, log_det = bijector.forward_and_log_det(z)
     expected = log_abs_det(bijector, z)
     # Autograd computes 1 - tanh(z)^2 by subtraction: at 8 it has lost 7 of its 16 digits.
-    assert (log_det - expected).abs().max() < 1e-9
+    assert (log_det - expected).abs().max() < 1e-9 + case.cancellation
     torch.testing.assert_close(bijector.log_abs_det_jacobian(z, action), log_det, rtol=0, atol=0)
 
 

@@ -11,8 +11,9 @@ from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, tensor
 from tests.bijectors.numeric import log_abs_det
 
 ids = {"ids": lambda case: case.name}
-RETRACTING = ("aligned", "gauge")
-INTERSECTING = [case for case in CASES if case.kind in (*RETRACTING, "radial", "retraction")]
+RETRACTING = ("aligned", "gauge", "soft", "soft-rays")
+OTHERS = ("radial", "retraction", "soft-alone", "recession")
+INTERSECTING = [case for case in CASES if case.kind in (*RETRACTING, *OTHERS)]
 
 
 def stage_count(case: Case) -> int:
@@ -58,14 +59,14 @@ def test_reference_of_the_radial_squash_is_its_first_stage(case: Case) -> None:
     torch.testing.assert_close(log_det, stages.log_dets[0], rtol=1e-12, atol=1e-10)
 
 
-@pytest.mark.parametrize("case", CASES, **ids)
+@pytest.mark.parametrize("case", [case for case in CASES if case.kind != "recession"], **ids)
 def test_log_dets_accumulate(case: Case) -> None:
     bijector = case.build(torch.float64)
     z = torch.cat([latents(case, 4, torch.float64, length) for length in (0.5, 3.0)])
     log_dets = bijector.stages(z).log_dets
     for stage in range(stage_count(case)):
         expected = log_abs_det(lambda x, stage=stage: bijector.stages(x).actions[stage], z)
-        assert (log_dets[stage] - expected).abs().max() < 1e-9
+        assert (log_dets[stage] - expected).abs().max() < 1e-9 + case.cancellation
 
 
 @pytest.mark.parametrize("case", INTERSECTING, **ids)

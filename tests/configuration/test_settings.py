@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from cnfp_torchrl.configuration import require_settings
+from cnfp_torchrl.configuration import config_directory, require_settings
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
@@ -126,3 +127,14 @@ def test_a_whole_number_may_have_an_exponent(
 def test_no_other_number_is_whole(given: str, make_config: Callable[..., DictConfig]) -> None:
     with pytest.raises(ValueError, match=r"collector\.total_frames: expected a whole number >= 1"):
         require_settings(make_config(f"collector.total_frames={given}"))
+
+
+def test_a_task_states_discount_and_target_entropy_unless_they_are_given() -> None:
+    def losses(*overrides: str) -> tuple[Any, Any]:
+        with initialize_config_dir(str(config_directory()), version_base="1.3"):
+            loss = compose("train", overrides=list(overrides)).loss
+        return loss.gamma, loss.target_entropy
+
+    assert losses() == (0.95, -4.0)
+    assert losses("loss.gamma=0.9", "loss.target_entropy=-1") == (0.9, -1)
+    assert losses("~env.gamma", "~env.target_entropy") == (0.99, "auto")

@@ -1,19 +1,22 @@
 """Our parts in TorchRL's groups of configurations, and its own trainer that trains with them."""
 
+from copy import deepcopy
 from dataclasses import fields
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
-import torchrl.trainers.algorithms.configs  # noqa: F401 - registers TorchRL's groups
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-import cnfp_torchrl.configuration.torchrl_groups as groups
 from cnfp_torchrl.envs import ActionGuard, ConstrainedActions, appended_transforms
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.objectives import ConstrainedSACLoss
@@ -26,6 +29,30 @@ OURS = {
     "loss": ["constrained_sac"],
     "logger": ["rerun"],
 }
+
+
+@cache
+def registered() -> tuple[ModuleType, Any]:
+    """Return the module, and Hydra's store with TorchRL's groups and ours.
+
+    Hydra's own store is left without them: commands of the same process would warn of theirs.
+    """
+    Plugins.instance()  # registers Hydra's own, once a process
+    store = ConfigStore.instance()
+    before = deepcopy(store.repo)
+    try:
+        import_module("torchrl.trainers.algorithms.configs")
+        module = import_module("cnfp_torchrl.configuration.torchrl_groups")
+        return module, store.repo
+    finally:
+        store.repo = before
+
+
+@pytest.fixture(autouse=True)
+def groups(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module, repo = registered()
+    monkeypatch.setattr(ConfigStore.instance(), "repo", repo)
+    return module
 
 
 def trainer_config(*overrides: str) -> Any:
@@ -42,13 +69,13 @@ def test_registered_beside_torchrls(group: str, name: str) -> None:
     assert callable(get_object(node["_target_"]))
 
 
-def test_the_table_of_the_module_lists_them() -> None:
+def test_the_table_of_the_module_lists_them(groups: ModuleType) -> None:
     for group, names in OURS.items():
         for name in names:
             assert f"| ``{group}`` | ``{name}`` |" in (groups.__doc__ or "")
 
 
-def test_transforms_are_made_and_fields_are_arguments() -> None:
+def test_transforms_are_made_and_fields_are_arguments(groups: ModuleType) -> None:
     for node, made in (
         (groups.ActionGuardConfig(), ActionGuard),
         (groups.ConstrainedActionsConfig(unbounded=True), ConstrainedActions),

@@ -22,6 +22,9 @@ from cnfp_torchrl.geometry import (
     TaskSpaceBall,
 )
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from tests.host_reads import HostReads
+
+STATES = 64
 
 
 class SpeedLimit(GeometryTransform):
@@ -353,3 +356,85 @@ def test_a_set_is_that_of_its_own_state(
     env = constrain_env(PointNavEnv(batch), geometry("speed"))
     with pytest.raises(GeometryError, match=r"'speed', field 'center'.*state alone"):
         env.reset()
+
+
+# What a step checks -------------------------------------------------------------------------------
+
+
+def test_a_step_reads_its_checks_on_the_host_once() -> None:
+    plain = PointNavEnv([STATES], seed=0)
+    env = constrain_env(PointNavEnv([STATES], seed=0), ObstacleGeometry(), BatteryGeometry())
+    counts = []
+    for each in (plain, env):
+        state = each.reset()
+        state["action"] = torch.zeros(STATES, 2)
+        state = each.step_mdp(each.step(state))
+        state["action"] = torch.zeros(STATES, 2)
+        with HostReads() as reads:
+            each.step(state)
+        counts.append(reads.count)
+    assert counts[1] - counts[0] == 1
+
+
+class Late(GeometryTransform):
+    """Is right in the beginning, and then not."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        x = tensordict["observation"]
+        radius = torch.where(x[..., 0] == 0.5, -1.0, 1.0)
+        return Ball(torch.zeros_like(x[..., :2]), radius, validate_args=False)
+
+
+@pytest.mark.parametrize("with_anchor", [True, False])
+def test_what_is_no_set_is_refused_in_the_step_that_leads_to_it(with_anchor: bool) -> None:
+    env = constrain_env(PointNavEnv([3]), Late("late"), with_anchor=with_anchor)
+    where = torch.tensor([[0.6, 0.6], [0.4, 0.6], [0.7, 0.6]])
+    state = env.reset(position=where)
+    action = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    message = r"'late' \(Ball\), field 'radius' at index \[1\]: expected a finite radius >= 0"
+    with pytest.raises(GeometryError, match=message):
+        env.step(state.set("action", action))
+    # The error leaves nothing behind.
+    env.step(env.reset(position=where).set("action", torch.zeros(3, 2)))
+
+
+def test_checks_can_be_left_out() -> None:
+    env = constrain_env(PointNavEnv([3]), Late("late"), with_anchor=False, validate=False)
+    state = env.reset(position=torch.tensor([0.5, 0.6]))
+    assert float(state["constraints", "late", "radius"].max()) == -1
+
+
+def test_checks_that_nobody_settles_any_more_are_not_lost() -> None:
+    env = constrain_env(PointNavEnv([3]), Late("late"))
+    env.reset()
+    alone = env.transform[0]
+    bad = TensorDict({"observation": torch.full((3, 5), 0.5)}, batch_size=3)
+    with pytest.raises(GeometryError, match="radius"):
+        alone._call(alone._call(bad))
+    with pytest.raises(GeometryError, match="radius"):
+        env.transform[0].clone()(bad)
+
+
+FAMILIES: list[tuple[ConstraintSet, str]] = [
+    (Ball(torch.zeros(4, 2), torch.ones(4)), "radius"),
+    (Box(-torch.ones(4, 2), torch.ones(4, 2)), "low"),
+    (HalfSpaces(torch.ones(4, 1, 2), torch.ones(4, 1)), "normals"),
+    (TaskSpaceBall(torch.ones(4, 1, 2), torch.ones(4, 1), torch.ones(4)), "offset"),
+]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e35, -1.0, 3.0])
+@pytest.mark.parametrize(("good", "field"), FAMILIES)
+def test_the_check_on_the_device_agrees_with_the_one_that_explains(
+    good: ConstraintSet, field: str, bad: float
+) -> None:
+    assert bool(good.is_valid())
+    fields = {name: value.clone() for name, value in good.fields().items()}
+    fields[field].view(4, -1)[2, 0] = bad
+    changed = type(good)(**fields, validate_args=False)
+    try:
+        changed.validate()
+    except GeometryError:
+        assert not bool(changed.is_valid())
+    else:
+        assert bool(changed.is_valid())

@@ -1,15 +1,15 @@
-"""The interior-point method's Newton steps against autograd, and what families tell it."""
+"""The interior-point method: its bounds on the way, and what families tell it."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, PositivePart, WeightedL1Ball
-from cnfp_torchrl.geometry.anchor.interior_point import newton
+from cnfp_torchrl.geometry.anchor.interior_point import ConeScaling
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
-from cnfp_torchrl.geometry.anchor.program import Point, Program
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
 from tests.geometry.cases import CASES, Case
 
 
@@ -26,33 +26,56 @@ def sets(dim: int) -> list[ConstraintSet]:
     ]
 
 
-def program(chosen: list[ConstraintSet], batch: int = 1) -> Program:
-    return Program.stack([part for each in chosen if (part := each.superlevel())], batch)
+def program(chosen: list[ConstraintSet]) -> Program:
+    """Return the problem of the most slack in all sets."""
+    bounds = chosen[0]
+    assert isinstance(bounds, Box)
+    stacked = Program.stack([part for each in chosen if (part := each.superlevel())], bounds)
+    width = len(stacked.rows) - 2 * len(stacked.reach) + len(stacked.cones)
+    every = np.ones((width, len(bounds.low)), dtype=bool)
+    return stacked.requiring(0.0 * every, every, every)
 
 
-def close(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
+def close(lower: Array, upper: Array, index: Index) -> Flags:
     """Tell where bounds are close."""
     return upper - lower <= 1e-7
 
 
 @pytest.mark.parametrize("kinds", [(0,), (0, 3, 4), (0, 1), (0, 1, 2), (0, 1, 2, 3, 4)])
-def test_newton_steps_are_those_of_autograd(kinds: tuple[int, ...]) -> None:
+def test_bounds_hold_on_the_way_and_close_in(kinds: tuple[int, ...]) -> None:
+    """At each step the lower bound is an action's slack, and no random action beats the upper."""
     dim = 4
-    problem = program([each for i, each in enumerate(sets(dim)) if i in kinds])
-    start = problem.start(0.5 * torch.randn(1, dim).double(), torch.ones(1).double())
-    eta = torch.tensor([3.0], dtype=torch.float64)
-    x = torch.cat([start.action[0], start.slack, start.terms.flatten()])
+    chosen = [each for i, each in enumerate(sets(dim)) if i in kinds]
+    intersection = Intersection.of(chosen)
+    start = 0.5 * torch.randn(1, dim).double().numpy()
+    rows = np.ones((1, sum(intersection.widths)), dtype=bool)
+    seen: list[tuple[float, float]] = []
 
-    def objective(x: Tensor) -> Tensor:
-        at = Point(x[None, :dim], x[dim : dim + 1], x[dim + 1 :].view_as(start.terms))
-        return (problem.barrier(problem.distances(at)) - eta * at.slack)[0]
+    def watched(lower: Array, upper: Array, index: Index) -> Flags:
+        seen.append((lower.item(), upper.item()))
+        return close(lower, upper, index)
 
-    gradient = torch.autograd.functional.jacobian(objective, x)
-    step = -torch.linalg.solve(torch.autograd.functional.hessian(objective, x), gradient)
-    move, decrement = newton(problem, start, problem.distances(start), eta)
-    given = torch.cat([move.action[0], move.slack, move.terms.flatten()])
-    torch.testing.assert_close(given, step, rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(decrement[0], -gradient @ step, rtol=1e-9, atol=1e-12)
+    best = intersection.maximize(0.0 * rows, rows, rows, start, watched)
+    found = torch.from_numpy(best.action)
+    slack = torch.stack([each.slack(found) for each in chosen]).amin()
+    assert slack.item() == pytest.approx(best.slack.item(), abs=1e-7)
+    around = found + torch.logspace(-6, 0, 5000).double().unsqueeze(-1) * torch.randn(5000, dim)
+    reached = torch.stack([each.slack(around) for each in chosen]).amin(0).amax().item()
+    assert all(reached <= upper for _, upper in seen)
+    assert all(lower <= best.upper_bound.item() for lower, _ in seen)
+    assert best.upper_bound.item() - best.slack.item() <= 1e-7
+    # Newton's method, not bisection.
+    assert len(seen) < 25
+
+
+def test_the_scaling_of_cones() -> None:
+    """It makes slack and weight the same vector, and its two directions are inverse."""
+    vectors = torch.randn(2, 3, 4, 5).double()
+    vectors[:, :, 0] = vectors[:, :, 1:].norm(dim=2) * (1 + torch.rand(2, 3, 5)) + 1e-3
+    slack, weight = vectors.numpy()
+    scaling = ConeScaling.between(slack, weight)
+    np.testing.assert_allclose(scaling.scaled(weight), scaling.unscaled(slack), rtol=1e-8)
+    np.testing.assert_allclose(scaling.unscaled(scaling.scaled(slack)), slack, rtol=1e-8)
 
 
 def test_rows_that_do_not_count_change_nothing() -> None:
@@ -62,12 +85,10 @@ def test_rows_that_do_not_count_change_nothing() -> None:
     for some, counts in ((everything, chosen), (kept, [True] * 3)):
         intersection = Intersection.of(some)
         width = intersection.widths[0]
-        on = torch.tensor([[counts[0]] * width + counts[1:]])
-        required = torch.zeros(on.shape, dtype=torch.float64)
-        start = torch.zeros(1, 3).double()
-        results.append(intersection.maximize(required, on, on, start, close))
+        on = np.array([[counts[0]] * width + counts[1:]])
+        results.append(intersection.maximize(0.0 * on, on, on, np.zeros((1, 3)), close))
     for given, expected in zip(*results, strict=True):
-        torch.testing.assert_close(given, expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(given, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_required_is_kept() -> None:
@@ -75,15 +96,13 @@ def test_what_is_required_is_kept() -> None:
     ones = torch.ones(1, 2, dtype=torch.float64)
     chosen = [Box(-ones, ones), Ball(3 * ones * torch.tensor([1.0, 0.0]), ones[:, 0])]
     intersection = Intersection.of(chosen)
-    counts = torch.ones(1, 5, dtype=torch.bool)
-    trial = torch.tensor([[False] * 4 + [True]])
+    counts = np.ones((1, 5), dtype=bool)
+    trial = np.array([[False] * 4 + [True]])
     for least in (0.0, 0.1):
-        required = torch.tensor([[least] * 4 + [0.0]]).double()
-        best = intersection.maximize(required, trial, counts, 0 * ones, close)
+        required = np.array([[least] * 4 + [0.0]])
+        best = intersection.maximize(required, trial, counts, np.zeros((1, 2)), close)
         assert best.slack.item() == pytest.approx(-1 - least, abs=1e-6)
-        torch.testing.assert_close(
-            best.action, torch.tensor([[1 - least, 0.0]]).double(), rtol=0, atol=1e-3
-        )
+        np.testing.assert_allclose(best.action, [[1 - least, 0.0]], rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -91,11 +110,11 @@ def test_descriptions_agree_with_the_slack(case: Case) -> None:
     batch = case.sets.batch_shape
     index = torch.arange(batch.numel())
     chosen = [each.select(batch, index) for each in (case.bounds, case.sets)]
-    problem = program(chosen, len(index))
+    problem = program(chosen)
     for direction in case.directions(20, torch.float64):
         action = (case.inside + 2 * direction).expand(*batch, -1).reshape(len(index), -1)
         expected = torch.minimum(*(each.slack(action) for each in chosen))
-        given = problem.slack(action)
+        given = torch.from_numpy(problem.slack(action.numpy()))
         if case.convex:
             torch.testing.assert_close(given, expected, rtol=1e-9, atol=1e-9 * case.size)
         else:

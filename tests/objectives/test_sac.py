@@ -1,5 +1,6 @@
 """Soft actor-critic on constrained actors: TorchRL's loss and ours."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,8 +14,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
+from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.modules import flow_head, with_reference_entropy
-from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss
+from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss, usual_target_entropy
 from cnfp_torchrl.training.networks import action_cost_network
 
 MakeActor = Callable[..., Any]
@@ -314,16 +316,22 @@ def test_unknown_settings_are_refused(
 
 
 @pytest.mark.parametrize("entropy", ["reference", "action"])
-def test_a_batched_action_spec_is_refused(
+def test_the_target_entropy_is_that_of_one_action_whatever_the_spec(
     env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, entropy: str
 ) -> None:
-    batched = {"action_spec": env.action_spec, "entropy": entropy}
-    with pytest.raises(ValueError, match=r"action_spec: expected .* 2 components.*given .*128"):
-        ConstrainedSACLoss(make_actor(), critic, **batched)
-    # Where the number is given, the spec is not asked.
-    loss = ConstrainedSACLoss(make_actor(), critic, target_entropy=-4.0, **batched)
+    for spec in (env.action_spec, env.full_action_spec, env.action_spec_unbatched, None):
+        loss = ConstrainedSACLoss(make_actor(), critic, entropy=entropy, action_spec=spec)
+        assert float(loss.target_entropy) == -2
+    loss = ConstrainedSACLoss(make_actor(), critic, entropy=entropy, target_entropy=-4.0)
     assert float(loss.target_entropy) == -4
-    composite = ConstrainedSACLoss(
-        make_actor(), critic, entropy=entropy, action_spec=env.full_action_spec
-    )
-    assert float(composite.target_entropy) == -2
+
+
+def test_the_usual_target_entropy_follows_the_units_of_the_action() -> None:
+    def target(low: list[float], high: list[float]) -> float:
+        return usual_target_entropy(Box(torch.tensor(low), torch.tensor(high)))
+
+    assert target([-1.0] * 6, [1.0] * 6) == -6
+    # As far below the entropy of the uniform distribution, log of the volume, in any units.
+    below = math.log(2) + 1
+    wide = target([-2.0, 0.0], [2.0, 1e-3])
+    assert wide == pytest.approx(math.log(4) + math.log(1e-3) - 2 * below)

@@ -1,6 +1,5 @@
 """A run that was stopped ends as one that was not."""
 
-import json
 import os
 import resource
 import signal
@@ -13,7 +12,6 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from rerun.chunk import RrdReader
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, TransformedEnv
 
 from cnfp_torchrl.configuration import config_directory
@@ -25,12 +23,12 @@ from cnfp_torchrl.training.resume import resumed_config
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BrokenCheckpointWarning
 from cnfp_torchrl.training.train import train
+from experiments.resume import differences
 
 from .conftest import TINY as SHORT
 
 MakeConfig = Callable[..., DictConfig]
 
-OF_THE_CLOCK = ("train/seconds", "train/processor_seconds", "train/steps_per_second")
 TINY = [*SHORT, "evaluation.episodes=1", "training.update_ratio=0.1", "checkpoint.interval=64"]
 
 
@@ -60,50 +58,6 @@ def go_on(path: Path, *overrides: str, make_config: MakeConfig) -> dict[str, Any
     return train(config, folder, resume=True)
 
 
-def same(first: Any, second: Any) -> bool:
-    """Tell whether two states are equal bit by bit."""
-    if isinstance(first, torch.Tensor):
-        return torch.equal(first, second)
-    if isinstance(first, dict):
-        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
-    if isinstance(first, list | tuple):
-        return len(first) == len(second) and all(map(same, first, second))
-    return bool(first == second) or (first != first and second != second)
-
-
-def scalars(path: Path) -> dict[str, str]:
-    """Return the rows of the CSV files but for those of the clock."""
-    root = path / "metrics" / "scalars"
-    files = {str(file.relative_to(root))[:-4]: file for file in root.rglob("*.csv")}
-    return {name: file.read_text() for name, file in files.items() if name not in OF_THE_CLOCK}
-
-
-def events(path: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return the points in TensorBoard's files, in the order in which they were written."""
-    points: dict[str, list[tuple[int, float]]] = {}
-    for file in sorted((path / "tensorboard").iterdir()):
-        reader = EventAccumulator(str(file), purge_orphaned_data=False).Reload()
-        for name in reader.Tags()["scalars"]:
-            if name not in OF_THE_CLOCK:
-                points.setdefault(name, []).extend((e.step, e.value) for e in reader.Scalars(name))
-    return points
-
-
-def assert_same_run(first: Path, second: Path) -> None:
-    states = [RunFolder(path).load_checkpoint() for path in (first, second)]
-    assert same(*states)
-    assert scalars(first) == scalars(second)
-    assert scalars(first)
-    assert events(first) == events(second)
-    results = [summary(path) for path in (first, second)]
-    assert results[0] == results[1]
-
-
-def summary(path: Path) -> dict[str, Any]:
-    content = json.loads((path / "summary.json").read_text())
-    return {name: value for name, value in content.items() if name != "seconds"}
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that was not stopped."""
@@ -121,7 +75,16 @@ def test_a_killed_run_ends_as_one_that_was_not(
 ) -> None:
     run_until(make_config(*TINY), tmp_path / "killed", killed_at)
     go_on(tmp_path / "killed", make_config=make_config)
-    assert_same_run(whole, tmp_path / "killed")
+    assert not differences(whole, tmp_path / "killed")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_run_on_a_gpu_goes_on_there(make_config: MakeConfig, tmp_path: Path) -> None:
+    config = make_config(*TINY, "device=cuda")
+    train(config, RunFolder.create(tmp_path / "whole"))
+    run_until(config, tmp_path / "killed", 160)
+    go_on(tmp_path / "killed", make_config=make_config)
+    assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
 OTHERS = {
@@ -137,7 +100,7 @@ def test_runs_of_all_kinds_go_on(kind: str, make_config: MakeConfig, tmp_path: P
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "killed", 160)
     go_on(tmp_path / "killed", make_config=make_config)
-    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+    assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
 def gymnasium_env(name: str) -> EnvBase:
@@ -159,7 +122,7 @@ def test_episodes_of_mujoco_go_on(make_config: MakeConfig, tmp_path: Path) -> No
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "killed", 160)
     go_on(tmp_path / "killed", make_config=make_config)
-    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+    assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
 def test_where_an_environment_gives_no_state_its_episodes_begin_anew(
@@ -195,7 +158,7 @@ def test_a_signal_stops_a_run_when_it_is_saved(
     assert f"resume={tmp_path / 'stopped'}" in str(stopped.value)
     assert handlers == [signal.getsignal(each) for each in STOP_SIGNALS]
     go_on(folder.path, make_config=make_config)
-    assert_same_run(whole, folder.path)
+    assert not differences(whole, folder.path)
 
 
 def test_a_second_signal_stops_at_once() -> None:
@@ -219,7 +182,7 @@ def test_a_finished_run_can_be_extended(make_config: MakeConfig, tmp_path: Path)
         go_on(tmp_path / "extended", "collector.total_frames=96", make_config=make_config)
     assert (tmp_path / "extended" / "summary.json").read_text() == before
     go_on(tmp_path / "extended", longer, make_config=make_config)
-    assert_same_run(tmp_path / "whole", tmp_path / "extended")
+    assert not differences(tmp_path / "whole", tmp_path / "extended")
     assert RunFolder(tmp_path / "extended").load_settings()["collector"]["total_frames"] == 288
 
 
@@ -289,7 +252,7 @@ def test_an_older_state_serves_where_the_newest_is_broken(
     newest.write_bytes(newest.read_bytes()[:1000])
     with pytest.warns(BrokenCheckpointWarning, match=r"state-0*128\.pt.*goes on at step 64"):
         go_on(stopped, make_config=make_config)
-    assert_same_run(whole, stopped)
+    assert not differences(whole, stopped)
 
 
 def test_on_a_full_disk_the_states_before_stay(
@@ -314,7 +277,7 @@ def test_on_a_full_disk_the_states_before_stay(
     states = (folder.path / STATES).glob("*state-*")
     assert [path.name for path in states] == ["state-000000000064.pt"]
     go_on(folder.path, make_config=make_config)
-    assert_same_run(whole, folder.path)
+    assert not differences(whole, folder.path)
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(

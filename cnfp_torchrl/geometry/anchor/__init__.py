@@ -4,7 +4,10 @@ from cnfp_torchrl.geometry.anchor.attempts import attempt_anchor
 from cnfp_torchrl.geometry.anchor.depth import DEPTH, row_depths
 from cnfp_torchrl.geometry.anchor.lexicographic import (
     LEEWAY,
+    Begun,
+    begin_anchor,
     chebyshev_center,
+    finish_anchor,
     lexicographic_anchor,
     relaxation_floor,
 )
@@ -14,8 +17,11 @@ __all__ = [
     "DEPTH",
     "LEEWAY",
     "Anchored",
+    "Begun",
     "attempt_anchor",
+    "begin_anchor",
     "chebyshev_center",
+    "finish_anchor",
     "lexicographic_anchor",
     "relaxation_floor",
     "row_depths",

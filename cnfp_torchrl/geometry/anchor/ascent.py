@@ -243,7 +243,7 @@ class Ascent:
     def _last(self, value: Tensor, events: int = 1) -> Tensor:
         """Return values ``(*batch, *event)`` as ``(*event, B)``."""
         event = value.shape[value.ndim - events :]
-        flat = value.expand(*self.shape, *event).reshape(-1, *event)
+        flat = value.expand((*self.shape, *event)).reshape(-1, *event)
         return flat.movedim(0, -1).contiguous()
 
 
@@ -253,7 +253,7 @@ def _least(values: Sequence[Tensor]) -> Tensor:
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve with positive definite matrices ``(d, d, B)``, by elimination where they are small."""
-    if len(right) > 4:
+    if len(right) > 4 and not torch.compiler.is_exporting():
         solution = torch.linalg.solve_ex(matrix.permute(2, 0, 1), right.mT.unsqueeze(-1))[0]
         return solution.squeeze(-1).mT
     rest = torch.cat([matrix, right.unsqueeze(1)], 1)

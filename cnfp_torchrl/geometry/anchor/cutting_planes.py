@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.interior_point import Best, Settled, maximize_slack
-from cnfp_torchrl.geometry.anchor.program import Program
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 MAX_CUTS = 300
@@ -18,11 +18,10 @@ MAX_CUTS = 300
 def maximize_slack_by_cuts(
     problem: Program,
     sets: Sequence[ConstraintSet],
-    required: Tensor,
-    trial: Tensor,
-    counts: Tensor,
-    start: Tensor,
-    scale: Tensor,
+    required: Array,
+    trial: Flags,
+    counts: Flags,
+    start: Array,
     settled: Settled,
 ) -> Best:
     r"""Do what `maximize_slack` does with further sets, of which only the slack is known.
@@ -33,68 +32,69 @@ def maximize_slack_by_cuts(
     drawn back towards the start until it is inside.
 
     Args:
-        problem: B problems in float64, without the sets.
-        sets: further sets, each of batch shape ``(B,)``, in float64.
+        problem: B problems, without the sets.
+        sets: further sets, each of batch shape ``(B,)``, in float64 on the CPU.
         required: slacks that those on trial exceed by t, ``(B, len(sets))``.
-        trial: flags of the sets on trial, boolean ``(B, len(sets))``.
-        counts: flags of the sets that count, boolean ``(B, len(sets))``.
+        trial: flags of the sets on trial, ``(B, len(sets))``.
+        counts: flags of the sets that count, ``(B, len(sets))``.
         start: points strictly inside of all that must hold, ``(B, d)``.
-        scale: mean widths of the action bounds, ``(B,)``.
         settled: function that tells which problems need no more work.
     """
-    found = Best(
-        start.clone(), torch.full_like(scale, -torch.inf), torch.full_like(scale, torch.inf)
-    )
-    left = torch.arange(len(start), device=start.device)
+    batch = len(start)
+    found = Best(start.copy(), np.full(batch, -np.inf), np.full(batch, np.inf))
+    left = np.arange(batch)
     for _ in range(MAX_CUTS):
         at, needs, tried, on = start[left], required[left], trial[left], counts[left]
 
-        def half_settled(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
+        def half_settled(lower: Array, upper: Array, index: Index) -> Flags:
             """Tell where a point is well inside the rows so far."""
             total = left[index]  # noqa: B023 - called before left changes
             lowest = found.slack[total]
             return (lower - lowest >= (upper - lowest) / 2) | settled(lower, upper, total)
 
-        best = maximize_slack(problem, at, scale[left], half_settled)
-        slacks, gradients = _linearized(sets, left, len(start), best.action)
-        rooms, rooms_at_start = (
-            torch.where(on, slack - needs, torch.inf)
-            for slack in (slacks, _slacks(sets, left, len(start), at))
-        )
+        best = maximize_slack(problem, at, half_settled)
+        slacks, gradients = _linearized(sets, left, batch, best.action)
+        rooms = slacks - needs
+        rooms_at_start = _slacks(sets, left, batch, at) - needs
         # Of what must hold, at least the chord to the start does.
-        share = rooms_at_start / (rooms_at_start - rooms)
-        share = torch.where((rooms < 0) & ~tried & on, share, 1.0).amin(-1, keepdim=True)
+        outside, share = (rooms < 0) & ~tried & on, np.ones_like(rooms)
+        np.divide(rooms_at_start, rooms_at_start - rooms, out=share, where=outside)
+        share = share.min(-1, keepdims=True)
         action = at + share * (best.action - at)
-        rooms = _slacks(sets, left, len(start), action) - needs
-        slack = torch.where(on & tried, rooms, torch.inf).amin(-1).minimum(problem.slack(action))
+        rooms = _slacks(sets, left, batch, action) - needs
+        slack = np.where(on & tried, rooms, np.inf).min(-1)
+        slack = np.minimum(slack, problem.slack(action))
         better = slack > found.slack[left]
-        found.action[left] = torch.where(better.unsqueeze(-1), action, found.action[left])
-        found.slack[left] = torch.where(better, slack, found.slack[left])
-        found.upper_bound[left] = found.upper_bound[left].minimum(best.upper_bound)
+        found.action[left] = np.where(better[:, None], action, found.action[left])
+        found.slack[left] = np.where(better, slack, found.slack[left])
+        found.upper_bound[left] = np.minimum(found.upper_bound[left], best.upper_bound)
         undecided = ~settled(found.slack[left], found.upper_bound[left], left)
-        if not bool(undecided.any()):
+        if not undecided.any():
             break
-        offsets = slacks - needs - (gradients * best.action.unsqueeze(-2)).sum(-1)
-        problem = problem.with_rows(-gradients, offsets, tried.to(slacks), on)
-        problem, left = problem.select(undecided), left[undecided]
+        offsets = slacks - needs - (gradients * best.action[:, None]).sum(-1)
+        normals = -np.moveaxis(gradients, 0, -1)
+        problem = problem.with_rows(normals, offsets.T, tried.T, on.T).select(undecided)
+        left = left[undecided]
     return found
 
 
-def _slacks(sets: Sequence[ConstraintSet], index: Tensor, batch: int, action: Tensor) -> Tensor:
+def _slacks(sets: Sequence[ConstraintSet], index: Index, batch: int, action: Array) -> Array:
     """Return slacks ``(B, len(sets))``."""
-    chosen = [s.select(torch.Size([batch]), index) for s in sets]
-    return torch.stack([s.slack(action) for s in chosen], -1)
+    shape, at = torch.Size([batch]), torch.from_numpy(index)
+    slacks = [s.select(shape, at).slack(torch.from_numpy(action)).numpy() for s in sets]
+    return np.stack(slacks, -1)
 
 
 def _linearized(
-    sets: Sequence[ConstraintSet], index: Tensor, batch: int, action: Tensor
-) -> tuple[Tensor, Tensor]:
+    sets: Sequence[ConstraintSet], index: Index, batch: int, action: Array
+) -> tuple[Array, Array]:
     """Return slacks ``(B, len(sets))`` and their gradients ``(B, len(sets), d)``."""
     slacks, gradients = [], []
     for constraint_set in sets:
         with torch.enable_grad():
-            at = action.detach().requires_grad_()
-            slack = constraint_set.select(torch.Size([batch]), index).slack(at)
-            gradients.append(torch.autograd.grad(slack.sum(), at)[0])
-        slacks.append(slack.detach())
-    return torch.stack(slacks, -1), torch.stack(gradients, -2)
+            at = torch.from_numpy(action).requires_grad_()
+            chosen = constraint_set.select(torch.Size([batch]), torch.from_numpy(index))
+            slack = chosen.slack(at)
+            gradients.append(torch.autograd.grad(slack.sum(), at)[0].numpy())
+        slacks.append(slack.detach().numpy())
+    return np.stack(slacks, -1), np.stack(gradients, -2)

@@ -1,229 +1,349 @@
-"""A batched interior-point method for the largest smallest slack of several convex sets.
+r"""A batched primal-dual interior-point method for the largest smallest slack of convex sets.
 
-Path-following with the logarithmic barrier: for growing eta, Newton's method minimizes
-``-eta t + barrier(a, t)``. Every iterate is strictly feasible, so its slack is a lower bound of the
-best one; a small Newton decrement certifies an upper bound (Nesterov, Introductory Lectures on
-Convex Optimization, 2004, theorem 4.2.7).
+Newton's method goes towards :math:`s \circ z = \mu`, with the slacks s of rows and cones and their
+weights z, scaled such that both are the same vector (Nesterov and Todd 1997). Predictor and
+corrector share one factorization (Mehrotra 1992; for cones: Vandenberghe, The CVXOPT linear and
+quadratic cone program solvers, 2010).
+
+Every point on the way is strictly feasible, so its slack is a lower bound of the best one. Whatever
+the weights are, they certify an upper bound, by weak duality, with what their gradients leave over
+bounded over the action bounds: no bound rests on convergence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import NamedTuple, Self, TypeAlias
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from cnfp_torchrl.geometry.anchor.program import Distances, Point, Program
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program, length, times
 
-MAX_ITERATIONS = 150
-"""The number of Newton steps after which the best point so far is taken; 15 are usual, 50 rare."""
+MAX_ITERATIONS = 60
+"""The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
 
-_GROWTH = 20.0
-_TRIALS = 6
+_FRACTION = 0.995
+"""The share of the way to the boundary that a step may go."""
+
+_SMALL = 8
+"""The largest number of unknowns for which elimination side by side is the fastest."""
 
 
 class Best(NamedTuple):
     """The best found actions ``(B, d)``, their slacks, and upper bounds of the slack ``(B,)``."""
 
-    action: Tensor
-    slack: Tensor
-    upper_bound: Tensor
+    action: Array
+    slack: Array
+    upper_bound: Array
 
 
-Settled: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+Settled: TypeAlias = Callable[[Array, Array, Index], Flags]
 """From lower and upper bounds of the best t, and the problems' indices: which need no more work."""
 
 
-def maximize_slack(problem: Program, start: Tensor, scale: Tensor, settled: Settled) -> Best:
+def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
     """Find actions whose smallest slack is large, and certified upper bounds of it.
 
     Stops for each problem as soon as its bounds say enough: at once where a set is so far from the
-    bounds that its Lipschitz slack does, which Newton's method could not tell from rounding error.
-    Where rounding error keeps the bounds apart, the best point so far is returned: its slack is
-    true, and no more is claimed for the upper bound.
+    bounds that the largest slack within them does, which Newton's method could not tell from
+    rounding error. Where rounding error keeps the bounds apart, the best point so far is returned:
+    its slack is true, and no more is claimed for the upper bound.
 
     Args:
-        problem: B problems in float64, with rows that bound the actions on all sides.
-        start: points strictly inside of the inequalities of rate 0, ``(B, d)``.
-        scale: mean widths of the bounds, ``(B,)``.
+        problem: B problems, with rows that bound the actions on all sides.
+        start: points strictly inside of what is not on trial, ``(B, d)``.
         settled: function that tells which problems need no more work.
     """
-    at = problem.start(start, scale)
-    # The bounds' diagonal at most; outside of the bounds nothing is feasible.
-    upper_bound = problem.bound_within(start, scale * start.shape[-1])
-    found = Best(start.clone(), problem.slack(start), upper_bound)
-    # The eta for which the start is best in t.
-    eta = _pull_on_slack(problem, at)
-    nu = float(problem.barrier_parameter())
-    left = torch.arange(len(start), device=start.device)
-    lower, upper, action = found.slack, upper_bound, at.action
-    for _ in range(MAX_ITERATIONS):
-        undecided = ~settled(lower, upper, left)
-        if not bool(undecided.all()):
-            found = _settle(found, left, lower, upper, action)
-            if not bool(undecided.any()):
-                return found
-            problem, left = problem.select(undecided), left[undecided]
-            lower, upper, action = lower[undecided], upper[undecided], action[undecided]
-            eta, at = eta[undecided], Point(*(variable[undecided] for variable in at))
-        distances = problem.distances(at)
-        slack = at.slack + problem.gained(distances)
-        action = torch.where((slack > lower).unsqueeze(-1), at.action, action)
-        lower = torch.maximum(slack, lower)
-        move, squared = newton(problem, at, distances, eta)
-        # The absolute value, because a negative one is all rounding error.
-        decrement = squared.abs().sqrt()
-        near = decrement < 0.5
-        gap = (nu + (decrement + nu**0.5) * decrement / (1 - decrement)) / eta
-        upper = torch.minimum(upper, torch.where(near, at.slack + gap, torch.inf))
-        at = _line_search(problem, at, move, eta, decrement)
-        eta = torch.where(near, eta * _GROWTH, eta)
-    return _settle(found, left, lower, upper, action)
+    # Some of the problems that go on after they are settled may end in infinities.
+    with np.errstate(all="ignore"):
+        x = problem.start(start)
+        found, largest, bound = x.copy(), np.empty(len(start)), np.empty(len(start))
+        left = np.arange(len(start))
+        path = _Path.begin(problem, x)
+        lower, upper, best = x[problem.dim] + 1, problem.bound(), x
+        for iteration in range(MAX_ITERATIONS + 1):
+            scale = problem.unit[left]
+            undecided = ~settled(lower * scale, upper * scale, left)
+            count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
+            if count <= len(left) // 2:
+                # Until then those that are settled go on with the others, but count no more.
+                found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
+                if not count:
+                    break
+                path, left, best = path.select(undecided), left[undecided], best[:, undecided]
+                lower, upper = lower[undecided], upper[undecided]
+                undecided = undecided[undecided]
+            slack, height = path.slacks()
+            least, above, product = path.bounds(slack, height)
+            better = undecided & (least > lower)
+            best = np.where(better, path.x, best)
+            lower = np.where(better, least, lower)
+            upper = np.where(undecided & (above < upper), above, upper)
+            path.advance(slack, height, product)
+        return Best(problem.action(found), largest, bound)
 
 
-def _settle(found: Best, index: Tensor, lower: Tensor, upper: Tensor, action: Tensor) -> Best:
-    """Return what was found with the bounds and actions of some of the problems."""
-    return Best(
-        found.action.index_copy(0, index, action),
-        found.slack.index_copy(0, index, lower),
-        found.upper_bound.index_copy(0, index, upper),
-    )
-
-
-def newton(problem: Program, at: Point, distances: Distances, eta: Tensor) -> tuple[Point, Tensor]:
-    """Return the Newton direction of ``-eta t + barrier`` and its squared decrement ``(B,)``.
+@dataclass(eq=False)
+class _Path:
+    """Points and weights of B problems on their way.
 
     Args:
-        problem: B problems.
-        at: strictly feasible points.
-        distances: distances of these points from the inequalities.
-        eta: weights of t, ``(B,)``.
-    """
-    inverse = distances.rows.reciprocal().unsqueeze(-1)
-    rows = torch.cat([problem.rows, problem.row_rates.unsqueeze(-1)], -1) * inverse
-    gradient, hessian = rows.sum(-2), rows.mT @ rows
-    gradient[:, -1] -= eta
-    if problem.has_cones:
-        _add_cones(problem, at, distances, gradient, hessian)
-    if not problem.has_sums:
-        move = -_solve(hessian, gradient)
-        return Point(move[:, :-1], move[:, -1], at.terms), -(gradient * move).sum(-1)
-    sums = _KinkedSums.at(problem, distances)
-    own, eliminated = sums.gradients()
-    hessian = hessian + sums.reduced_hessian()
-    move = -_solve(hessian, gradient + own - eliminated)
-    terms = sums.move_of_terms(move)
-    decrement = -((gradient + own) * move).sum(-1) - (sums.gradient * terms).sum((-2, -1))
-    return Point(move[:, :-1], move[:, -1], terms), decrement
-
-
-def _add_cones(
-    problem: Program, at: Point, s: Distances, gradient: Tensor, hessian: Tensor
-) -> None:
-    """Add the barriers of cones, ``-log(h^2 - |y|^2)``, to gradient and Hessian in (action, t)."""
-    white = problem.white(at.action)
-    height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-    inverse = 2 / (s.cone_gaps * s.cone_sums)
-    # Half of the gradient times h^2 - |y|^2.
-    pulled = (problem.matrices * white.unsqueeze(-1)).sum(-2)
-    z = torch.cat([pulled, (height * problem.cone_rates).unsqueeze(-1)], -1)
-    z = z * inverse.unsqueeze(-1)
-    gradient += z.sum(-2)
-    hessian += z.mT @ z
-    matrices = (problem.matrices * inverse.sqrt()[..., None, None]).flatten(1, 2)
-    hessian[:, :-1, :-1] += matrices.mT @ matrices
-    hessian[:, -1, -1] -= (inverse * problem.cone_rates.square()).sum(-1)
-
-
-class _KinkedSums(NamedTuple):
-    """Barriers of kinked sums, whose terms' bounds u are eliminated: diagonal plus rank one.
-
-    The Hessian in u is ``diag(curvature) + r^2 1 1^T``, that of u and the action ``-diag(pull)``,
-    that of u and the slack ``r^2 rates``.
+        rows: rows of the program, ``(M, n, B)``.
+        offsets: their offsets, ``(M, B)``.
+        cones: cones of the program, ``(J, 1 + k, n, B)``.
+        tips: their constants, ``(J, 1 + k, B)``.
+        spare: 0 for what is on trial and infinite for the others, ``(M + J, B)``.
+        low: least values of all unknowns but t, ``(n, B)``.
+        high: largest values of all unknowns but t, ``(n, B)``.
+        x: unknowns, ``(n, B)``.
+        weights: weights of the rows, ``(M, B)``.
+        duals: weights of the cones, ``(J, 1 + k, B)``.
+        dim: number d of components of an action, after which t stands in x.
     """
 
-    problem: Program
-    p: Tensor
-    q: Tensor
-    r: Tensor
-    curvature: Tensor
-    pull: Tensor
-    gradient: Tensor
-    kappa: Tensor
+    rows: Array
+    offsets: Array
+    cones: Array
+    tips: Array
+    spare: Array
+    low: Array
+    high: Array
+    x: Array
+    weights: Array
+    duals: Array
+    dim: int
 
     @classmethod
-    def at(cls, problem: Program, s: Distances) -> Self:
-        p, q, r = s.upper.reciprocal(), s.lower.reciprocal(), s.sums.reciprocal()
-        curvature = p.square() + q.square()
-        kappa = r.square() / (1 + r.square() * curvature.reciprocal().sum(-1))
-        pull = problem.upper * p.square() + problem.lower * q.square()
-        return cls(problem, p, q, r, curvature, pull, r.unsqueeze(-1) - p - q, kappa)
+    def begin(cls, problem: Program, x: Array) -> Self:
+        """Return the paths from points on, with weights for which the points are best in t."""
+        dim = problem.dim
+        rates = np.concatenate([problem.rows[:, dim], problem.cones[:, 0, dim]])
+        low, high = np.zeros_like(x), np.ones_like(x)
+        low[:dim], high[dim + 1 :] = -1, problem.reach
+        path = cls(
+            rows=problem.rows,
+            offsets=problem.offsets,
+            cones=problem.cones,
+            tips=problem.tips,
+            spare=np.where(rates > 0, 0.0, np.inf),
+            low=low,
+            high=high,
+            x=x,
+            weights=problem.offsets,
+            duals=problem.tips,
+            dim=dim,
+        )
+        slack, height = path.slacks()
+        weights, duals = 1 / slack, _flipped(height) / _det(height)[:, None]
+        pull = (np.concatenate([weights, duals[:, 0]]) * rates).sum(0)
+        path.weights, path.duals = weights / pull, duals / pull
+        return path
 
-    def solve(self, right: Tensor) -> Tensor:
-        """Solve with the Hessian in u, by Sherman and Morrison."""
-        scaled = right / self.curvature
-        return scaled - (self.kappa * scaled.sum(-1)).unsqueeze(-1) / self.curvature
+    def select(self, keep: Flags) -> Self:
+        """Return some of the B paths."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values.items()})
 
-    def gradients(self) -> tuple[Tensor, Tensor]:
-        """Return the gradient in (action, slack), and what elimination takes off it."""
-        upper, lower, rates = self.problem.upper, self.problem.lower, self.problem.sum_rates
-        own = _joined((upper * self.p + lower * self.q).sum(-2), (rates * self.r).sum(-1))
-        relaxed = self.solve(self.gradient)
-        slack = (rates * self.r.square() * relaxed.sum(-1)).sum(-1)
-        return own, _joined(-(self.pull * relaxed).sum(-2), slack)
+    def slacks(self) -> tuple[Array, Array]:
+        """Return the slacks of rows ``(M, B)`` and of cones ``(J, 1 + k, B)``."""
+        slack = self.offsets - times(self.rows, self.x)
+        return slack, self.tips - times(self.cones, self.x) if len(self.cones) else self.tips
 
-    def reduced_hessian(self) -> Tensor:
-        """Return the Schur complement in (action, slack)."""
-        spread = self.p * self.q * (self.problem.upper - self.problem.lower)
-        row = _joined(self.pull / self.curvature, self.problem.sum_rates)
-        diagonal = (spread.square() / self.curvature).sum(-2)
-        diagonal = _joined(diagonal, torch.zeros_like(diagonal[:, 0]))
-        return torch.diag_embed(diagonal) + (row * self.kappa.unsqueeze(-1)).mT @ row
+    def bounds(self, slack: Array, height: Array) -> tuple[Array, Array, Array]:
+        """Return bounds of the best t, and the weighted sums of all slacks, ``(B,)`` each."""
+        rooms, pull = slack, _pulled(self.rows, self.weights)
+        product = (slack * self.weights).sum(0)
+        if len(self.cones):
+            rooms = np.concatenate([slack, height[:, 0] - length(height[:, 1:])])
+            product = product + (height * self.duals).sum((0, 1))
+            pull = pull + _pulled(_side_by_side(self.cones), _side_by_side(self.duals))
+        # What the weighted mean of all slacks may become within the bounds.
+        rest = np.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
+        rest[self.dim] = product
+        t = self.x[self.dim]
+        return t + (rooms + self.spare).min(0), t + rest.sum(0) / pull[self.dim], product
 
-    def move_of_terms(self, move: Tensor) -> Tensor:
-        """Return the Newton direction of u that goes with one of (action, slack)."""
-        slack = self.problem.sum_rates * self.r.square() * move[:, -1:]
-        pulled = self.pull * move[:, None, :-1] - slack.unsqueeze(-1)
-        return self.solve(pulled - self.gradient)
+    def advance(self, slack: Array, height: Array, product: Array) -> None:
+        """Take a step, from slacks and their weighted sums."""
+        count = len(slack)
+        root = np.sqrt(self.weights / slack)
+        scaled, point = self.rows * root[:, None], slack * root
+        scaling = ConeScaling.between(height, self.duals) if len(self.cones) else None
+        if scaling is not None:
+            cones = [scaling.unscaled(self.cones), scaling.scaled(self.duals)]
+            scaled = np.concatenate([scaled, _side_by_side(cones[0])])
+            point = np.concatenate([point, _side_by_side(cones[1])])
+        matrix = _Normal.of(scaled)
+        goal = np.zeros_like(self.x)
+        goal[self.dim] = 1
+        fall = times(scaled, matrix.solve(goal))
+        share = 1 / np.maximum(self._limits(point, np.stack([fall, point - fall])).max(0), 1)
+        # The less a step without centering would gain, the more centering there is.
+        center = (1 - share) ** 3 * (product / (count + len(self.cones)))
+        aim = (center + (fall * (fall - point))[:count]) / point[:count]
+        if scaling is not None:
+            own, falls = (v[count:].reshape(height.shape) for v in (point, fall))
+            wanted = _product(falls, falls - own)
+            wanted[:, 0] += center
+            aim = np.concatenate([aim, _side_by_side(_quotient(wanted, own))])
+        move = matrix.solve(goal - _pulled(scaled, aim))
+        fall = times(scaled, move)
+        loss = point - aim - fall
+        limits = self._limits(point, np.stack([fall, loss]))
+        if scaling is not None:
+            limits[:] = limits.max(0)
+        ahead, along = _FRACTION / np.maximum(limits, _FRACTION)
+        self.x = self.x + ahead * move
+        self.weights = self.weights - along * (root * loss[:count])
+        if scaling is not None:
+            change = scaling.unscaled(loss[count:].reshape(height.shape))
+            self.duals = self.duals - along * change
+
+    def _limits(self, point: Array, changes: Array) -> Array:
+        """Return the inverse of the largest steps of slacks and weights, ``(2, B)``.
+
+        Args:
+            point: slacks, which are as large as the weights, in the scaling of the step.
+            changes: what a step takes off the slacks and off the weights.
+        """
+        count = len(self.rows)
+        limits = (changes[:, :count] / point[:count]).max(1)
+        if len(self.cones):
+            own = point[count:].reshape(self.duals.shape)
+            falls = changes[:, count:].reshape(2, *self.duals.shape)
+            # A cone is left where own - step * falls has a determinant of 0, a quadratic.
+            det, along = _det(own), (_flipped(own) * falls).sum(2)
+            squared = np.square(falls[:, :, 0]) - np.square(falls[:, :, 1:]).sum(2)
+            steepest = (along + np.sqrt(np.maximum(along * along - squared * det, 0))) / det
+            limits = np.maximum(limits, steepest.max(1))
+        return limits
 
 
-def _joined(action: Tensor, slack: Tensor) -> Tensor:
-    return torch.cat([action, slack.unsqueeze(-1)], -1)
+class ConeScaling(NamedTuple):
+    r"""The symmetric scaling W of cones with :math:`W z = W^{-1} s` for slacks s and weights z.
+
+    Args:
+        head: first components of the axes, which are of determinant 1, ``(J, B)``.
+        tail: other components of the axes, ``(J, k, B)``.
+        size: sizes ``(J, B)``.
+    """
+
+    head: Array
+    tail: Array
+    size: Array
+
+    @classmethod
+    def between(cls, slack: Array, weight: Array) -> Self:
+        """Return the scaling for slacks and weights ``(J, 1 + k, B)`` inside of the cones."""
+        of_slack, of_weight = _det(slack), _det(weight)
+        s, z = slack / np.sqrt(of_slack)[:, None], weight / np.sqrt(of_weight)[:, None]
+        axis = (s + _flipped(z)) / np.sqrt(2 + 2 * (s * z).sum(1))[:, None]
+        return cls(axis[:, 0], axis[:, 1:], np.sqrt(np.sqrt(of_slack / of_weight)))
+
+    def scaled(self, v: Array) -> Array:
+        """Return W v, of vectors ``(J, 1 + k, B)``."""
+        dot = (self.tail * v[:, 1:]).sum(1)
+        result = np.empty_like(v)
+        result[:, 0] = self.head * v[:, 0] + dot
+        result[:, 1:] = v[:, 1:] + (v[:, 0] + dot / (1 + self.head))[:, None] * self.tail
+        return result * self.size[:, None]
+
+    def unscaled(self, v: Array) -> Array:
+        """Return the inverse of W times v, of vectors ``(J, 1 + k, B)`` or ``(J, 1 + k, n, B)``."""
+        head, tail, size = self
+        if v.ndim == 4:
+            head, tail, size = head[:, None], tail[:, :, None], size[:, None]
+        dot = (tail * v[:, 1:]).sum(1)
+        result = np.empty_like(v)
+        result[:, 0] = head * v[:, 0] - dot
+        result[:, 1:] = v[:, 1:] + (dot / (1 + head) - v[:, 0])[:, None] * tail
+        return result / size[:, None]
 
 
-def _pull_on_slack(problem: Program, at: Point) -> Tensor:
-    s = problem.distances(at)
-    pull = (problem.row_rates / s.rows).sum(-1)
-    if problem.has_cones:
-        height = problem.cone_sizes - problem.cone_rates * at.slack.unsqueeze(-1)
-        pull = pull + (2 * height * problem.cone_rates / (s.cone_gaps * s.cone_sums)).sum(-1)
-    if problem.has_sums:
-        pull = pull + (problem.sum_rates / s.sums).sum(-1)
-    return pull
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Matrices ``S^T S``, factorized as ``U^T D U`` where they are small.
+
+    Args:
+        matrix: matrices ``(B, n, n)``, if they are not factorized.
+        rows: rows of U right of its diagonal of ones.
+        diagonal: diagonal of D, ``(B,)`` each.
+    """
+
+    matrix: Array | None
+    rows: list[Array]
+    diagonal: list[Array]
+
+    @classmethod
+    def of(cls, scaled: Array) -> Self:
+        """Return the matrices for S, ``(m, n, B)``."""
+        if scaled.shape[1] > _SMALL:
+            first = np.ascontiguousarray(scaled.transpose(2, 0, 1))
+            matrix = first.transpose(0, 2, 1) @ first
+            # Rounding may have made a matrix singular.
+            each = np.arange(scaled.shape[1])
+            matrix[:, each, each] *= 1 + 1e-14
+            # Of problems that went on after they were settled, which no longer count.
+            matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
+            return cls(matrix, [], [])
+        rest = np.einsum("mib,mjb->ijb", scaled, scaled)
+        rows, diagonal = [], []
+        for least in 1e-15 * np.einsum("iib->ib", rest):
+            # Where rounding made a matrix indefinite, t still grows along the direction.
+            pivot = np.maximum(rest[0, 0], least)
+            row = rest[0, 1:] / pivot
+            rest = rest[1:, 1:] - rest[1:, :1] * row
+            rows.append(row)
+            diagonal.append(pivot)
+        return cls(None, rows, diagonal)
+
+    def solve(self, right: Array) -> Array:
+        """Return the solutions for right-hand sides ``(n, B)``."""
+        if self.matrix is not None:
+            solution = np.linalg.solve(self.matrix, right.T[..., None])
+            return np.asarray(solution[..., 0].T, dtype=np.float64)
+        x = right.copy()
+        for i, row in enumerate(self.rows):
+            x[i + 1 :] -= row * x[i]
+        for i in range(len(x) - 1, -1, -1):
+            x[i] = x[i] / self.diagonal[i] - (self.rows[i] * x[i + 1 :]).sum(0)
+        return x
 
 
-def _line_search(problem: Program, at: Point, move: Point, eta: Tensor, decrement: Tensor) -> Point:
-    """Take the best step between the damped Newton step, which always helps, and a full one."""
-    share = torch.linspace(1, 0, _TRIALS, dtype=eta.dtype, device=eta.device).unsqueeze(-1)
-    steps = (1 + decrement) ** -share
-    trials = at.moved(move, steps)
-    value = problem.barrier(problem.distances(trials)) - eta * (steps * move.slack)
-    best = steps.gather(0, value.argmin(0, keepdim=True)).squeeze(0)
-    return at.moved(move, best)
+def _pulled(matrix: Array, weights: Array) -> Array:
+    """Return the product of transposed matrices ``(m, n, B)`` with vectors ``(m, B)``."""
+    return np.asarray(np.einsum("mib,mb->ib", matrix, weights), dtype=np.float64)
 
 
-def _solve(hessian: Tensor, right: Tensor) -> Tensor:
-    """Solve with a positive definite matrix, scaled to a unit diagonal."""
-    scale = hessian.diagonal(dim1=-2, dim2=-1).rsqrt()
-    scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
-    factor, failed = torch.linalg.cholesky_ex(scaled)
-    if bool(failed.any()):
-        # Rounding made a matrix indefinite; a shift of that size gives a descent direction, and
-        # where not even that helps, the diagonal does.
-        identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        shifted, hopeless = torch.linalg.cholesky_ex(scaled + 1e-9 * identity)
-        shifted = torch.where((hopeless > 0)[:, None, None], identity, shifted)
-        factor = torch.where((failed > 0)[:, None, None], shifted, factor)
-    right = (right * scale).unsqueeze(-1)
-    return (torch.cholesky_solve(right, factor).squeeze(-1) * scale).nan_to_num()
+def _side_by_side(v: Array) -> Array:
+    """Return vectors or matrices ``(J, 1 + k, ...)`` of all cones as ``(J (1 + k), ...)``."""
+    return v.reshape(-1, *v.shape[2:])
+
+
+def _flipped(v: Array) -> Array:
+    """Return vectors ``(J, 1 + k, B)`` with the sign of all but their first component changed."""
+    result = -v
+    result[:, 0] = v[:, 0]
+    return result
+
+
+def _det(v: Array) -> Array:
+    """Return the square of the first component less that of the length of the others."""
+    size = length(v[:, 1:])
+    return (v[:, 0] - size) * (v[:, 0] + size)
+
+
+def _product(u: Array, v: Array) -> Array:
+    """Return the Jordan product of vectors of cones."""
+    result = u[:, :1] * v + v[:, :1] * u
+    result[:, 0] = (u * v).sum(1)
+    return result
+
+
+def _quotient(u: Array, v: Array) -> Array:
+    """Return what gives u when multiplied by v, by the Jordan product."""
+    first = ((_flipped(v) * u).sum(1) / _det(v))[:, None]
+    result = (u - first * v) / v[:, :1]
+    result[:, :1] = first
+    return result

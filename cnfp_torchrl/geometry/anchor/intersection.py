@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.cutting_planes import maximize_slack_by_cuts
 from cnfp_torchrl.geometry.anchor.interior_point import Best, Settled, maximize_slack
-from cnfp_torchrl.geometry.anchor.program import Program
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
@@ -22,22 +22,25 @@ class Intersection:
     """B intersections of sets, whose R rows stand side by side, in the order of the sets.
 
     Args:
-        sets: in float64, of batch shape ``(B,)``; the first is the finite box of action bounds.
+        sets: in float64 on the CPU, of batch shape ``(B,)``; the first is the finite box of action
+            bounds.
         widths: the number of rows of each set, R in sum.
         program: the inequalities that describe the sets, or of non-convex ones a convex part.
         described: the row of each of the program's inequalities, ``(M,)``.
-        plain: the sets that only state their slack.
+        own: the sets that tell their slacks themselves, because no description of them does.
+        plain: those of them that have no description.
     """
 
     sets: Sequence[ConstraintSet]
     widths: tuple[int, ...]
     program: Program
-    described: Tensor
+    described: Index
+    own: tuple[int, ...]
     plain: tuple[int, ...]
 
     @classmethod
-    def of(cls, sets: Sequence[ConstraintSet], near: Tensor | None = None) -> Self:
-        """Describe sets of batch shape ``(B,)`` in any dtype.
+    def of(cls, sets: Sequence[ConstraintSet], near: Array | None = None) -> Self:
+        """Describe sets of batch shape ``(B,)`` in any dtype, on any device.
 
         Args:
             sets: the first is the finite box of action bounds.
@@ -47,106 +50,106 @@ class Intersection:
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
         """
-        wide = [s.to(torch.float64) for s in sets]
+        wide = [s.to(torch.float64, "cpu") for s in sets]
         bounds = wide[0]
         if not isinstance(bounds, Box) or not bool((bounds.high - bounds.low).isfinite().all()):
             raise GeometryError("sets[0]: expected a finite Box of action bounds")
         for i, constraint_set in enumerate(wide):
             for name, field in constraint_set.fields().items():
-                if bool(field.isnan().any()):
+                if np.isnan(field.detach().numpy()).any():
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
         middle = (bounds.low + bounds.high) / 2
-        widths = tuple(int(s.row_slacks(middle).shape[-1]) for s in wide)
-        program, described, plain = _described(wide, widths, near, len(middle))
-        return cls(wide, widths, program, described, plain)
+        widths = tuple(
+            int(s.row_slacks(middle).shape[-1]) if type(s).has_rows() else 1 for s in wide
+        )
+        return cls._described(wide, widths, near)
 
-    def near(self, point: Tensor) -> Self:
+    def near(self, point: Array) -> Self:
         """Return the intersections with the convex parts near points ``(B, d)`` in their place."""
-        if all(self.convex):
-            return self
-        program, described, plain = _described(self.sets, self.widths, point, len(point))
-        return type(self)(self.sets, self.widths, program, described, plain)
+        return self if all(self.convex) else self._described(self.sets, self.widths, point)
+
+    @classmethod
+    def _described(
+        cls, sets: Sequence[ConstraintSet], widths: tuple[int, ...], near: Array | None
+    ) -> Self:
+        if near is None:
+            parts = [s.superlevel() for s in sets]
+        else:
+            parts = [s.part_near(torch.from_numpy(near)) for s in sets]
+        owners: dict[type[Superlevel], list[int]] = {KinkedSum: [], Rows: [], Cone: []}
+        own, first = [], 0
+        for i, (part, width) in enumerate(zip(parts, widths, strict=True)):
+            count = part.offsets.shape[-1] if isinstance(part, Rows) else 1
+            if part is not None:
+                # One inequality for each row, or several that make up a single one.
+                owners[type(part)] += [first + (j if count == width else 0) for j in range(count)]
+            if part is None or count != width or not _is_convex(sets[i]):
+                own.append(i)
+            first += width
+        described = np.array(owners[KinkedSum] + owners[Rows] + owners[Cone])
+        plain = tuple(i for i, part in enumerate(parts) if part is None)
+        bounds = sets[0]
+        assert isinstance(bounds, Box)
+        program = Program.stack([part for part in parts if part is not None], bounds)
+        return cls(sets, widths, program, described, tuple(own), plain)
 
     @property
     def convex(self) -> list[bool]:
         """Which of the sets are convex."""
-        return [type(s).part_near is ConstraintSet.part_near for s in self.sets]
+        return [_is_convex(s) for s in self.sets]
 
     @property
-    def bounds(self) -> Box:
-        """The action bounds."""
-        bounds = self.sets[0]
-        assert isinstance(bounds, Box)
-        return bounds
+    def bounds(self) -> tuple[Array, Array]:
+        """The action bounds, low and high, ``(B, d)``."""
+        middle, half = self.program.middle.T, self.program.half.T
+        return middle - half, middle + half
 
     def rows_of(self, index: int) -> slice:
         """Return where the rows of a set stand."""
         first = sum(self.widths[:index])
         return slice(first, first + self.widths[index])
 
-    def row_slacks(self, action: Tensor) -> Tensor:
+    def row_slacks(self, action: Array) -> Array:
         """Return the slacks of all rows, ``(B, R)``."""
-        slacks = [
-            constraint_set.row_slacks(action).expand(len(action), width)
-            for constraint_set, width in zip(self.sets, self.widths, strict=True)
-        ]
-        return torch.cat(slacks, -1)
+        slacks = np.empty((len(action), sum(self.widths)))
+        rooms = self.program.rooms(self.program.at(action)) * self.program.unit
+        slacks[:, self.described] = rooms.T
+        for i in self.own:
+            slacks[:, self.rows_of(i)] = self.sets[i].row_slacks(torch.from_numpy(action)).numpy()
+        return slacks
 
-    def select(self, index: Tensor) -> Self:
+    def select(self, index: Index) -> Self:
         """Return some of the B intersections."""
-        shape = torch.Size([len(self.program.rows)])
-        sets = [s.select(shape, index) for s in self.sets]
-        return type(self)(sets, self.widths, self.program.select(index), self.described, self.plain)
+        shape, at = torch.Size([len(self.program.unit)]), torch.from_numpy(index)
+        # Of sets that a description tells all about nothing reads the fields any more.
+        read = range(len(self.sets)) if not all(self.convex) else self.own
+        sets = [s.select(shape, at) if i in read else s for i, s in enumerate(self.sets)]
+        program = self.program.select(index)
+        return type(self)(sets, self.widths, program, self.described, self.own, self.plain)
 
     def maximize(
-        self, required: Tensor, trial: Tensor, counts: Tensor, start: Tensor, settled: Settled
+        self, required: Array, trial: Flags, counts: Flags, start: Array, settled: Settled
     ) -> Best:
         """Find the largest t by which the slacks of rows on trial exceed what is required of them.
 
         Args:
             required: slacks of all rows, ``(B, R)``.
-            trial: which rows are on trial, boolean ``(B, R)``; all others must have what is
-                required, and do at the start.
-            counts: which rows count at all, boolean ``(B, R)``.
+            trial: which rows are on trial, ``(B, R)``; all others must have what is required, and
+                do at the start.
+            counts: which rows count at all, ``(B, R)``.
             start: points strictly inside of what the rows not on trial require, ``(B, d)``.
             settled: tells which problems need no more work.
         """
-        bounds = self.bounds
-        scale = (bounds.high - bounds.low).mean(-1)
-        tried, counted = trial.to(required), counts.to(required)
         at = self.described
-        problem = self.program.requiring(required[:, at], tried[:, at], counted[:, at])
+        problem = self.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
         if not self.plain:
-            return maximize_slack(problem, start, scale, settled)
+            return maximize_slack(problem, start, settled)
         sets = [self.sets[i] for i in self.plain]
         rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(
-            problem,
-            sets,
-            required[:, rows],
-            trial[:, rows],
-            counts[:, rows],
-            start,
-            scale,
-            settled,
+            problem, sets, required[:, rows], trial[:, rows], counts[:, rows], start, settled
         )
 
 
-def _described(
-    sets: Sequence[ConstraintSet], widths: Sequence[int], near: Tensor | None, batch: int
-) -> tuple[Program, Tensor, tuple[int, ...]]:
-    """Return the program, the row of each of its inequalities, and the sets left out of it."""
-    parts = [s.superlevel() if near is None else s.part_near(near) for s in sets]
-    known = [part for part in parts if part is not None]
-    owners: dict[type[Superlevel], list[int]] = {Rows: [], Cone: [], KinkedSum: []}
-    first = 0
-    for part, width in zip(parts, widths, strict=True):
-        if part is not None:
-            count = part.offsets.shape[-1] if isinstance(part, Rows) else 1
-            # One inequality for each row, or several that make up a single one.
-            owners[type(part)] += [first + (i if count == width else 0) for i in range(count)]
-        first += width
-    described = torch.tensor(owners[Rows] + owners[Cone] + owners[KinkedSum])
-    plain = tuple(i for i, part in enumerate(parts) if part is None)
-    device = next(iter(sets[0].fields().values())).device
-    return Program.stack(known, batch), described.to(device), plain
+def _is_convex(constraint_set: ConstraintSet) -> bool:
+    return type(constraint_set).part_near is ConstraintSet.part_near

@@ -16,14 +16,22 @@ them, so that one impossible row loosens no other row that can hold beside it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.attempts import first_attempt, refined_attempt
+from cnfp_torchrl.geometry.anchor.attempts import (
+    Attempt,
+    first_attempt,
+    no_attempt,
+    refined_attempt,
+    select_states,
+)
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
-from cnfp_torchrl.geometry.anchor.interior_point import Best
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
+from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
@@ -40,7 +48,41 @@ is left.
 """
 
 
+class Begun(NamedTuple):
+    """The rule after its cheapest attempts, which decide many states.
+
+    Attributes:
+        sets: sets in order of application.
+        depths: depths of their rows.
+        attempt: points, and whether they are anchors.
+    """
+
+    sets: Sequence[ConstraintSet]
+    depths: list[Tensor]
+    attempt: Attempt
+
+    def all_held(self) -> Anchored:
+        """Return the anchors of states that are all decided: all sets hold."""
+        shape, anchor = self.attempt.decided.shape, self.attempt.anchor
+        active = torch.ones(*shape, len(self.sets), dtype=torch.bool, device=anchor.device)
+        amounts = tuple(depth.new_zeros(*shape, depth.shape[-1]) for depth in self.depths)
+        return Anchored(anchor, active, amounts)
+
+
 @torch.no_grad()
+def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Begun:
+    """Make the attempts that take the least time, and read no tensor on the host.
+
+    Args:
+        sets: sets in order of application, as in `lexicographic_anchor`.
+        candidate: points that may lie in all sets, ``(*batch, d)``.
+    """
+    depths = row_depths(sets)
+    if candidate is None and all(map(_is_described, sets)):
+        return Begun(sets, depths, no_attempt(sets))
+    return Begun(sets, depths, first_attempt(sets, depths, candidate))
+
+
 def lexicographic_anchor(
     sets: Sequence[ConstraintSet], candidate: Tensor | None = None, leeway: float = LEEWAY
 ) -> Anchored:
@@ -66,37 +108,51 @@ def lexicographic_anchor(
         GeometryError: when ``sets[0]`` is no box; where a search is needed, also when it is
             unbounded or a field has NaN in it.
     """
+    return finish_anchor(begin_anchor(sets, candidate), leeway)
+
+
+@torch.no_grad()
+def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
+    """Take steps inwards and search in the states that are not decided yet.
+
+    Args:
+        begun: what `begin_anchor` returned.
+        leeway: leeway, as in `lexicographic_anchor`.
+    """
     if not leeway > 0:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
+    sets, depths, found = begun
     bounds = bounds_of(sets)
-    depths = row_depths(sets)
-    found = first_attempt(sets, depths, candidate)
-    shape, dim = found.decided.shape, found.anchor.shape[-1]
-    anchor = found.anchor.reshape(-1, dim)
-    active = torch.ones(*shape, len(sets), dtype=torch.bool, device=anchor.device)
-    relaxation = [depth.new_zeros(*shape, depth.shape[-1]) for depth in depths]
-    left = (~found.decided).flatten().nonzero().squeeze(-1)
+    shape = found.decided.shape
+    _, active, relaxation = begun.all_held()
+    found = found.select()
+    anchor = found.anchor
+    left = (~found.decided).nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
-        sets = [s.select(shape, left) for s in sets]
-        depths = [_flat(depth, shape)[left] for depth in depths]
-        found = refined_attempt(sets, depths, found.select(left))
-        anchor = anchor.index_copy(0, left, found.anchor)
-        hard = (~found.decided).nonzero().squeeze(-1)
-        sets = [s.select(found.decided.shape, hard) for s in sets]
-        depths = [depth[hard] for depth in depths]
-        found, left = found.select(hard), left[hard]
+        some = shape
+        if len(left) < len(anchor):
+            sets, depths = select_states(sets, depths, shape, left)
+            some, found = left.shape, found.select(left)
+        refined = refined_attempt(sets, depths, found.view(some))
+        anchor = anchor.index_copy(0, left, refined.anchor)
+        if bool(refined.decided.all()):
+            left = left[:0]
+        else:
+            hard = (~refined.decided).nonzero().squeeze(-1)
+            sets, depths = select_states(sets, depths, some, hard)
+            found, left = refined.select(hard), left[hard]
     if len(left):
         margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
-        searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.upper)
+        searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.anchor, found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
-        active.view(-1, len(sets)).index_copy_(0, left, searched.active)
+        active.view(-1, len(sets)).index_copy_(0, left, searched.active.to(active.device))
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
         up = 1 + 4 * torch.finfo(anchor.dtype).eps
         for amount, found_amount in zip(relaxation, searched.relaxation, strict=True):
             flat = amount.view(-1, amount.shape[-1])
             flat.index_copy_(0, left, (up * found_amount).to(amount))
-    return Anchored(anchor.view(*shape, dim), active, tuple(relaxation))
+    return Anchored(anchor.view(*shape, anchor.shape[-1]), active, relaxation)
 
 
 def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:
@@ -114,7 +170,15 @@ def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> T
     return torch.stack(torch.broadcast_tensors(*floors), -1)
 
 
-def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
+class ChebyshevCenter(NamedTuple):
+    """The best found actions ``(B, d)``, their slacks, and upper bounds of the slack ``(B,)``."""
+
+    action: Tensor
+    slack: Tensor
+    upper_bound: Tensor
+
+
+def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> ChebyshevCenter:
     """Find points whose smallest slack in all sets is a large share of the best one.
 
     A batched interior-point method in float64. A set that does not describe its `superlevel` is
@@ -133,18 +197,25 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Best:
         GeometryError: when the first set is no finite box, or a field has NaN in it.
     """
     everything = Intersection.of(sets)
-    middle = (everything.bounds.low + everything.bounds.high) / 2
-    rows = torch.ones_like(everything.row_slacks(middle), dtype=torch.bool)
-    width = smallest_width(everything.bounds)
+    low, high = everything.bounds
+    middle, width = (low + high) / 2, (high - low).min(-1)
+    rows = np.ones((len(low), sum(everything.widths)), dtype=bool)
 
-    def settled(lower: Tensor, upper: Tensor, index: Tensor) -> Tensor:
+    def settled(lower: Array, upper: Array, index: Index) -> Flags:
         gap, decided = upper - lower, (lower > 0) | (upper < 0)
-        close = gap <= (1 - share) * torch.maximum(upper, -lower)
+        close = gap <= (1 - share) * np.maximum(upper, -lower)
         return (decided & close) | (gap <= 1e-9 * width[index])
 
-    return everything.maximize(
-        torch.zeros_like(rows, dtype=middle.dtype), rows, rows, middle, settled
-    )
+    best = everything.maximize(np.zeros(rows.shape), rows, rows, middle, settled)
+    like = next(iter(sets[0].fields().values()))
+    return ChebyshevCenter(*(torch.from_numpy(value).to(like.device) for value in best))
+
+
+def _is_described(constraint_set: ConstraintSet) -> bool:
+    """Tell whether steps inwards see all of a set, so that they can do without a first attempt."""
+    kind = type(constraint_set)
+    described = kind.superlevel is not ConstraintSet.superlevel
+    return described and kind.part_near is ConstraintSet.part_near
 
 
 def _flat(rows: Tensor, shape: torch.Size) -> Tensor:

@@ -1,259 +1,240 @@
-"""Problems of the largest smallest slack: stacks of rows, cones and kinked sums, and barriers."""
+r"""Problems of the largest smallest slack, as rows and second-order cones in one vector x.
+
+A problem's unknowns are :math:`x = (a, t, u)`: the action in half widths of the bounds about their
+middle, the slack t in mean half widths, and bounds u of the terms of kinked sums, of which each
+makes two rows, :math:`\alpha_i a_i \le u_i` and :math:`\beta_i a_i \le u_i`.
+
+The arrays are NumPy's, in float64, because a few small problems take a third of the time that way,
+and the batch comes last in those of a program, because many of them are solved side by side.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, Self
+from typing import Self, TypeAlias
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
-from torch.linalg import vector_norm
-from torch.nn.functional import pad
 
-from cnfp_torchrl.geometry.norms import spectral_norm_bound
+from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 
-
-class Point(NamedTuple):
-    """Primal variables: action ``(B, d)``, slack ``(B,)``, kinked terms' bounds ``(B, L, d)``."""
-
-    action: Tensor
-    slack: Tensor
-    terms: Tensor
-
-    def moved(self, by: Point, step: Tensor) -> Point:
-        """Return the point at a step ``(*trials, B)`` along a direction."""
-        along = step.unsqueeze(-1)
-        return Point(
-            self.action + along * by.action,
-            self.slack + step * by.slack,
-            self.terms + along.unsqueeze(-1) * by.terms,
-        )
-
-
-class Distances(NamedTuple):
-    """Distances of a point from each inequality: rows, cones' two factors, kinked sums' three."""
-
-    rows: Tensor
-    cone_gaps: Tensor
-    cone_sums: Tensor
-    upper: Tensor
-    lower: Tensor
-    sums: Tensor
+Array: TypeAlias = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+Index: TypeAlias = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """B problems "maximize t such that all sets have slack t", as stacks of rows, cones and sums.
+    """B problems "maximize t such that all sets have slack t".
 
-    Fields carry B first. An inequality has a rate of 0 where it must hold whatever t is. One that
-    does not count has no coefficients, a size of 1 and a rate of 0: it holds by 1 everywhere.
+    All slacks grow at the rate of one: a row or cone with a 0 for t must hold whatever t is. One
+    that does not count has no coefficients, and holds by 1 everywhere.
+
+    Args:
+        rows: coefficients of ``rows @ x <= offsets``, ``(M, n, B)``: the terms of kinked sums, the
+            sums, and other rows.
+        offsets: offsets of the rows, ``(M, B)``.
+        loose: offsets that let every action pass, for rows that do not count, ``(M, B)``.
+        cones: coefficients of ``tips - cones @ x``, whose first component is no less than the norm
+            of the others, ``(J, 1 + k, n, B)``.
+        tips: constants of the cones, ``(J, 1 + k, B)``.
+        middle: middles of the bounds, ``(d, B)``.
+        half: half widths of the bounds, ``(d, B)``.
+        unit: mean half widths, ``(B,)``.
+        reach: largest values of the terms of sums, whose least ones are 0, ``(n - d - 1, B)``.
     """
 
-    rows: Tensor
-    row_offsets: Tensor
-    row_rates: Tensor
-    matrices: Tensor
-    vectors: Tensor
-    cone_sizes: Tensor
-    cone_rates: Tensor
-    upper: Tensor
-    lower: Tensor
-    sum_sizes: Tensor
-    sum_rates: Tensor
+    rows: Array
+    offsets: Array
+    loose: Array
+    cones: Array
+    tips: Array
+    middle: Array
+    half: Array
+    unit: Array
+    reach: Array
 
     @classmethod
-    def stack(cls, parts: Sequence[Superlevel], batch: int) -> Self:
-        """Stack descriptions, each with batch shape ``(B,)``: all rows, all cones, all sums.
+    def stack(cls, parts: Sequence[Superlevel], bounds: Box) -> Self:
+        """Stack descriptions, each with batch shape ``(B,)``: kinked sums, rows and cones.
 
         Args:
-            parts: descriptions, one for each set, at least one of them with rows.
-            batch: number B of problems.
+            parts: descriptions in float64, one for each set.
+            bounds: finite bounds of the actions, ``(B, d)``.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
         sums = [part for part in parts if isinstance(part, KinkedSum)]
-        like, dim = rows[0].normals, rows[0].normals.shape[-1]
-        height = max((part.matrix.shape[-2] for part in cones), default=0)
+        batch, dim = bounds.low.shape
+        low, high = batch_last(bounds.low, batch, 1), batch_last(bounds.high, batch, 1)
+        middle, half = (low + high) / 2, (high - low) / 2
+        unit = half.mean(0)
+        terms = len(sums) * dim
+        width = dim + 1 + terms
+        reach = np.zeros((terms, batch))
+        many = sum(part.offsets.shape[-1] for part in rows)
+        first = 2 * terms + len(sums)
+        stacked, offsets = np.zeros((first + many, width, batch)), np.zeros((first + many, batch))
+        loose = np.ones_like(offsets)
+        each = np.arange(dim)
+        for i, total in enumerate(sums):
+            own = i * dim + each
+            rate = batch_last(total.rate, batch, 0) * unit
+            counts = rate > 0
+            rate = np.where(counts, rate, 1.0)
+            steepest = np.zeros((dim, batch))
+            for j, slope in enumerate((total.upper, total.lower)):
+                relative = batch_last(slope, batch, 1) / rate
+                stacked[j * terms + own, each] = relative * half
+                stacked[j * terms + own, dim + 1 + own] = -1
+                offsets[j * terms + own] = -relative * middle
+                steepest = np.maximum(steepest, np.abs(relative))
+            reach[own] = steepest * np.maximum(np.abs(low), np.abs(high))
+            stacked[2 * terms + i, dim + 1 + own] = 1
+            size = batch_last(total.size, batch, 0) / rate
+            offsets[2 * terms + i] = np.where(counts, size, np.inf)
+            loose[2 * terms + i] = 3 + 2 * reach[own].sum(0)
+        for part in rows:
+            last = first + part.offsets.shape[-1]
+            rates = batch_last(part.rates, batch, 1)
+            normals = batch_last(part.normals, batch, 2) / rates[:, None]
+            places = batch_last(part.offsets, batch, 1) / rates
+            offsets[first:last] = (places - times(normals, middle)) / unit
+            stacked[first:last, :dim] = normals * (half / unit)
+            first = last
+        height = 1 + max((part.matrix.shape[-2] for part in cones), default=0)
+        stacked_cones = np.zeros((len(cones), height, width, batch))
+        tips = np.zeros((len(cones), height, batch))
+        for i, cone in enumerate(cones):
+            rate = batch_last(cone.rate, batch, 0) * unit
+            matrix = batch_last(cone.matrix, batch, 2) / rate
+            last = 1 + len(matrix)
+            stacked_cones[i, 1:last, :dim] = -matrix * half
+            tips[i, 1:last] = batch_last(cone.vector, batch, 1) / rate + times(matrix, middle)
+            tips[i, 0] = batch_last(cone.size, batch, 0) / rate
+        return cls(stacked, offsets, loose, stacked_cones, tips, middle, half, unit, reach)
 
-        def joined(pieces: list[Tensor], *shape: int) -> Tensor:
-            """Concatenate pieces ``(*B, ...)`` along their first event dimension."""
-            if not pieces:
-                return like.new_zeros(batch, 0, *shape)
-            sizes = [piece.shape[-1 - len(shape) :] for piece in pieces]
-            return torch.cat([p.expand(batch, *n) for p, n in zip(pieces, sizes, strict=True)], 1)
-
-        program = cls(
-            rows=joined([p.normals for p in rows], dim),
-            row_offsets=joined([p.offsets for p in rows]),
-            row_rates=joined([p.rates for p in rows]),
-            matrices=joined(
-                [_rows_padded(p.matrix, height, -2)[..., None, :, :] for p in cones], height, dim
-            ),
-            vectors=joined(
-                [_rows_padded(p.vector, height, -1)[..., None, :] for p in cones], height
-            ),
-            cone_sizes=joined([p.size[..., None] for p in cones]),
-            cone_rates=joined([p.rate[..., None] for p in cones]),
-            upper=joined([torch.maximum(p.upper, p.lower)[..., None, :] for p in sums], dim),
-            lower=joined([torch.minimum(p.upper, p.lower)[..., None, :] for p in sums], dim),
-            sum_sizes=joined([p.size[..., None] for p in sums]),
-            sum_rates=joined([p.rate[..., None] for p in sums]),
-        )
-        # Infinite offsets and sums without weights let every action pass.
-        finite, cones_count = program.row_offsets.isfinite(), program.cone_rates > 0
-        return program._where(finite, cones_count, program.sum_rates > 0)
-
-    def requiring(self, required: Tensor, trial: Tensor, counts: Tensor) -> Self:
+    def requiring(self, required: Array, trial: Flags, counts: Flags) -> Self:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
-            required: slacks ``(B, M)`` required of all inequalities, in their order.
-            trial: flags of those that exceed it by t, 1 or 0; the others need no more than it.
-            counts: flags of those that count at all, 1 or 0.
+            required: slacks ``(R, B)`` required of all sums, rows and cones, in this order.
+            trial: flags of those that exceed it by t, ``(R, B)``; the others need no more than it.
+            counts: flags of those that count at all, ``(R, B)``.
         """
-        sizes = [self.row_rates.shape[-1], self.cone_rates.shape[-1], self.sum_rates.shape[-1]]
-        needs, trials, on = (rows.split(sizes, -1) for rows in (required, trial, counts))
-        shifted = replace(
-            self,
-            row_offsets=self.row_offsets - self.row_rates * needs[0],
-            row_rates=self.row_rates * trials[0],
-            cone_sizes=self.cone_sizes - self.cone_rates * needs[1],
-            cone_rates=self.cone_rates * trials[1],
-            sum_sizes=self.sum_sizes - self.sum_rates * needs[2],
-            sum_rates=self.sum_rates * trials[2],
-        )
-        return shifted._where(*(flags > 0 for flags in on))
-
-    def _where(self, rows: Tensor, cones: Tensor, sums: Tensor) -> Self:
-        """Return the problems of the inequalities that count."""
-
-        def kept(value: Tensor, mask: Tensor, otherwise: float = 0.0) -> Tensor:
-            return torch.where(mask[(...,) + (None,) * (value.ndim - mask.ndim)], value, otherwise)
-
-        return type(self)(
-            rows=kept(self.rows, rows),
-            row_offsets=kept(self.row_offsets, rows, 1.0),
-            row_rates=kept(self.row_rates, rows),
-            matrices=kept(self.matrices, cones),
-            vectors=kept(self.vectors, cones),
-            cone_sizes=kept(self.cone_sizes, cones, 1.0),
-            cone_rates=kept(self.cone_rates, cones),
-            upper=kept(self.upper, sums),
-            lower=kept(self.lower, sums),
-            sum_sizes=kept(self.sum_sizes, sums, 1.0),
-            sum_rates=kept(self.sum_rates, sums),
-        )
+        first, dim, needs = len(self.reach) * 2, self.dim, required / self.unit
+        split = len(self.rows) - first
+        on, cone_on = counts[:split] & np.isfinite(self.offsets[first:]), counts[split:]
+        rows, offsets = self.rows.copy(), self.offsets.copy()
+        # Sums keep the terms, which nothing else bounds.
+        sums = first // (2 * dim)
+        rows[first + sums :] *= on[sums:, None]
+        rows[first:, dim] = trial[:split] & on
+        offsets[first:] = np.where(on, offsets[first:] - needs[:split], self.loose[first:])
+        cones, tips = self.cones * cone_on[:, None, None], self.tips * cone_on[:, None]
+        cones[:, 0, dim] = trial[split:] & cone_on
+        tips[:, 0] = np.where(cone_on, tips[:, 0] - needs[split:], 1.0)
+        return replace(self, rows=rows, offsets=offsets, cones=cones, tips=tips)
 
     @property
-    def has_cones(self) -> bool:
-        """Whether there are any second-order cones."""
-        return self.matrices.shape[1] > 0
+    def dim(self) -> int:
+        """The dimension d of the actions."""
+        return len(self.middle)
 
-    @property
-    def has_sums(self) -> bool:
-        """Whether there are any kinked sums."""
-        return self.upper.shape[1] > 0
-
-    def select(self, keep: Tensor) -> Self:
+    def select(self, keep: Flags | Index) -> Self:
         """Return some of the B problems."""
-        return type(self)(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        return type(self)(**{f.name: getattr(self, f.name)[..., keep] for f in fields(self)})
 
-    def with_rows(self, normals: Tensor, offsets: Tensor, rates: Tensor, counts: Tensor) -> Self:
-        """Return the problems with rows ``(B, m, d)`` added, where they count."""
+    def with_rows(self, normals: Array, offsets: Array, trial: Flags, counts: Flags) -> Self:
+        """Return the problems with rows added, where they count.
+
+        Args:
+            normals: normals of the rows, ``(m, d, B)``, of slacks that are not divided further.
+            offsets: offsets of the rows, ``(m, B)``.
+            trial: flags of the rows on trial, ``(m, B)``.
+            counts: flags of the rows that count, ``(m, B)``.
+        """
+        rows = np.zeros((len(normals), *self.rows.shape[1:]))
+        rows[:, : self.dim] = normals * (self.half / self.unit) * counts[:, None]
+        rows[:, self.dim] = trial & counts
+        offsets = np.where(counts, (offsets - times(normals, self.middle)) / self.unit, 1.0)
         return replace(
             self,
-            rows=torch.cat([self.rows, normals * counts.unsqueeze(-1)], 1),
-            row_offsets=torch.cat([self.row_offsets, torch.where(counts, offsets, 1.0)], 1),
-            row_rates=torch.cat([self.row_rates, rates * counts], 1),
+            rows=np.concatenate([self.rows, rows]),
+            offsets=np.concatenate([self.offsets, offsets]),
+            loose=np.concatenate([self.loose, np.ones_like(offsets)]),
         )
 
-    def barrier_parameter(self) -> int:
-        """Return nu: one for each row, two for each cone, two and one a kinked sum's terms."""
-        terms = 2 * self.upper.shape[-1] + 1
-        return self.rows.shape[1] + 2 * self.matrices.shape[1] + terms * self.upper.shape[1]
+    def at(self, action: Array) -> Array:
+        """Return x ``(n, B)`` at actions ``(B, d)``, with a slack of 0 and exact terms of sums."""
+        x = np.zeros(self.rows.shape[1:])
+        x[: self.dim] = (action.T - self.middle) / self.half
+        if terms := len(self.reach):
+            rooms = self.offsets[: 2 * terms] - times(self.rows[: 2 * terms], x)
+            x[self.dim + 1 :] = np.maximum(-rooms[:terms], -rooms[terms:])
+        return x
 
-    def slack(self, action: Tensor) -> Tensor:
-        """Return the smallest slack at an action, ``(B,)``."""
-        return self._smallest(self._rooms(action))
+    def action(self, x: Array) -> Array:
+        """Return the actions ``(B, d)`` of unknowns."""
+        return np.ascontiguousarray((self.middle + self.half * x[: self.dim]).T)
 
-    def bound_within(self, action: Tensor, distance: Tensor) -> Tensor:
-        """Return an upper bound of the smallest slack within a distance of an action, ``(B,)``."""
-        kinks = torch.maximum(self.upper.abs(), self.lower.abs())
-        steepness = torch.cat(
-            [
-                vector_norm(self.rows, dim=-1),
-                spectral_norm_bound(self.matrices),
-                vector_norm(kinks, dim=-1),
-            ],
-            -1,
-        )
-        return self._smallest(self._rooms(action) + steepness * distance.unsqueeze(-1))
+    def start(self, action: Array) -> Array:
+        """Return x strictly inside at an action, its slack a mean half width below the possible."""
+        x = self.at(action)
+        x[self.dim] = self.slack_of(x) - 1
+        if terms := len(self.reach):
+            sums = slice(2 * terms, 2 * terms + terms // self.dim)
+            room = self.offsets[sums] - times(self.rows[sums], x)
+            x[self.dim + 1 :] += np.repeat(room / (2 * self.dim), self.dim, 0)
+        return x
 
-    def _rooms(self, action: Tensor) -> Tensor:
-        """Return by how much each inequality holds at a slack of zero."""
-        rows = self.row_offsets - (self.rows @ action.unsqueeze(-1)).squeeze(-1)
-        cones = self.cone_sizes - vector_norm(self.white(action), dim=-1)
-        sums = self.sum_sizes - self._terms(action).sum(-1)
-        return torch.cat([rows, cones, sums], -1)
+    def rooms(self, x: Array) -> Array:
+        """Return by how much sums, rows and cones hold, ``(R, B)``."""
+        first = 2 * len(self.reach)
+        rooms = self.offsets[first:] - times(self.rows[first:], x)
+        if not len(self.cones):
+            return rooms
+        height = self.tips - times(self.cones, x)
+        return np.concatenate([rooms, height[:, 0] - length(height[:, 1:])])
 
-    def _smallest(self, rooms: Tensor) -> Tensor:
-        """Return the smallest slack of those that rooms leave."""
-        rates = torch.cat([self.row_rates, self.cone_rates, self.sum_rates], -1)
-        return torch.where(rates > 0, rooms / rates, torch.inf).amin(-1)
+    def slack(self, action: Array) -> Array:
+        """Return the smallest slack at an action of what is on trial, ``(B,)``."""
+        return self.slack_of(self.at(action)) * self.unit
 
-    def start(self, action: Tensor, margin: Tensor) -> Point:
-        """Return a strictly feasible point at an action, its slack a margin below the possible."""
-        slack = self.slack(action) - margin
-        terms = self._terms(action)
-        room = self.sum_sizes - self.sum_rates * slack.unsqueeze(-1) - terms.sum(-1)
-        return Point(action, slack, terms + (room / (2 * action.shape[-1])).unsqueeze(-1))
+    def slack_of(self, x: Array) -> Array:
+        """Return the largest t at the actions and terms of x, ``(B,)``, in units."""
+        return x[self.dim] + np.where(self.rates() > 0, self.rooms(x), np.inf).min(0)
 
-    def gained(self, s: Distances) -> Tensor:
-        """Return by how much t could be larger at the action of a point, ``(B,)``."""
-        parts = [s.rows / self.row_rates]
-        if self.has_cones:
-            parts.append(s.cone_gaps / self.cone_rates)
-        if self.has_sums:
-            parts.append(s.sums / self.sum_rates)
-        return (torch.cat(parts, -1) if len(parts) > 1 else parts[0]).amin(-1)
+    def rates(self) -> Array:
+        """Return 1 for the sums, rows and cones on trial, ``(R, B)``."""
+        rows = self.rows[2 * len(self.reach) :, self.dim]
+        return np.concatenate([rows, self.cones[:, 0, self.dim]])
 
-    def barrier(self, s: Distances) -> Tensor:
-        """Return the barrier's value ``(*trials, B)``, infinite where a point is not feasible."""
-        value = s.rows.log().sum(-1)
-        if self.has_cones:
-            value = value + (s.cone_gaps.log() + s.cone_sums.log()).sum(-1)
-        if self.has_sums:
-            value = value + s.sums.log().sum(-1)
-            value = value + (s.upper.log() + s.lower.log()).sum((-2, -1))
-        return -value.nan_to_num(nan=-torch.inf, posinf=torch.inf)
-
-    def distances(self, at: Point) -> Distances:
-        """Return by how much each inequality holds; none may be negative."""
-        slack = at.slack.unsqueeze(-1)
-        rows = self.row_offsets - self.row_rates * slack
-        rows = rows - (self.rows @ at.action.unsqueeze(-1)).squeeze(-1)
-        gaps = sums = upper = lower = totals = rows[..., :0]
-        if self.has_cones:
-            height = self.cone_sizes - self.cone_rates * slack
-            length = vector_norm(self.white(at.action), dim=-1)
-            gaps, sums = height - length, height + length
-        if self.has_sums:
-            action = at.action.unsqueeze(-2)
-            upper, lower = at.terms - self.upper * action, at.terms - self.lower * action
-            totals = self.sum_sizes - self.sum_rates * slack - at.terms.sum(-1)
-        return Distances(rows, gaps, sums, upper, lower, totals)
-
-    def white(self, action: Tensor) -> Tensor:
-        """Return ``W a + y`` of each cone, ``(*trials, B, J, k)``."""
-        return (self.matrices @ action[..., None, :, None]).squeeze(-1) + self.vectors
-
-    def _terms(self, action: Tensor) -> Tensor:
-        action = action.unsqueeze(-2)
-        return torch.maximum(self.upper * action, self.lower * action)
+    def bound(self) -> Array:
+        """Return upper bounds of the smallest slack, from each slack's own range, ``(B,)``."""
+        dim, first = self.dim, 2 * len(self.reach)
+        most = self.offsets[first:] + np.abs(self.rows[first:, :dim]).sum(1)
+        reach = length(self.cones[:, 1:, :dim]).sum(1)
+        nearest = np.maximum(length(self.tips[:, 1:]) - reach, 0)
+        most = np.concatenate([most, self.tips[:, 0] - nearest])
+        return np.where(self.rates() > 0, most, np.inf).min(0)
 
 
-def _rows_padded(tensor: Tensor, height: int, axis: int) -> Tensor:
-    missing = height - tensor.shape[axis]
-    return pad(tensor, (0, missing) if axis == -1 else (0, 0, 0, missing))
+def batch_last(value: Tensor, batch: int, events: int) -> Array:
+    """Return values ``(*B, *event)`` as ``(*event, B)``."""
+    array = value.detach().cpu().numpy()
+    event = array.shape[array.ndim - events :]
+    return np.ascontiguousarray(np.moveaxis(np.broadcast_to(array, (batch, *event)), 0, -1))
+
+
+def times(matrix: Array, x: Array) -> Array:
+    """Return the product of matrices ``(..., m, n, B)`` with vectors ``(n, B)``."""
+    return np.asarray(np.einsum("...ib,ib->...b", matrix, x), dtype=np.float64)
+
+
+def length(vector: Array) -> Array:
+    """Return the norms ``(J, ..., B)`` of vectors ``(J, k, ..., B)``."""
+    return np.asarray(np.sqrt(np.square(vector).sum(1)), dtype=np.float64)

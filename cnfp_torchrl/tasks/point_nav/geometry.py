@@ -28,7 +28,8 @@ box keeps the way open, which the visible region does not.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
+from weakref import ref
 
 import torch
 from tensordict import TensorDictBase
@@ -48,7 +49,7 @@ from cnfp_torchrl.tasks.point_nav.shortest_path import (
     CAUTIOUS,
     MARGIN,
     ShortestPath,
-    side_distances,
+    StationWay,
 )
 
 SAFE_SPEED = 0.95
@@ -85,6 +86,35 @@ class PointNavGeometry(GeometryTransform):
         """Return `read_observation` of the states."""
         return read_observation(tensordict, self.in_keys[0])
 
+    def way(self, tensordict: TensorDictBase) -> StationWay:
+        """Return the way to the nearest station, which both constraints of a state ask for."""
+        global _last_way
+        observation, layout = tensordict.get(self.in_keys[0]), self.layout
+        known = _last_way
+        if known is not None and known.is_of(observation, layout):
+            return known.way
+        way = self.path.to_station(read_position(tensordict, self.in_keys[0]))
+        if not observation.is_inference():
+            _last_way = _KnownWay(ref(observation), observation._version, layout, way)
+        return way
+
+
+class _KnownWay(NamedTuple):
+    """The ways of the observation that was looked at last, as long as it is unchanged."""
+
+    observation: ref[Tensor]
+    version: int
+    layout: Layout
+    way: StationWay
+
+    def is_of(self, observation: Tensor, layout: Layout) -> bool:
+        """Tell whether the ways are those of an observation."""
+        same = self.observation() is observation and self.version == observation._version
+        return same and self.layout == layout
+
+
+_last_way: _KnownWay | None = None
+
 
 class ObstacleGeometry(PointNavGeometry):
     """A box of moves that touch no obstacle and keep the way to the nearest station open.
@@ -102,9 +132,8 @@ class ObstacleGeometry(PointNavGeometry):
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
-        position, _ = self.read(tensordict)
-        distance = side_distances(position, self.path.rectangles)
-        separates = self.path.to_station(position).separates
+        position, way = read_position(tensordict, self.in_keys[0]), self.way(tensordict)
+        distance, separates = way.side_distances, way.separates
         eligible = separates | ~separates.any(-1, keepdim=True)
         side = torch.where(eligible, distance, -torch.inf).argmax(-1, keepdim=True)
         chosen = torch.zeros_like(eligible).scatter(-1, side, value=True)
@@ -174,7 +203,8 @@ class BatteryGeometry(PointNavGeometry):
     turning radius. The ball is huge when the battery is full, and closes in on the station as the
     battery empties.
 
-    Publishes a candidate safe action, too: towards the waypoint, 0.95 of a step, not beyond it.
+    Publishes a candidate safe action, too: towards the waypoint, 0.95 of a step or, near a corner
+    of the action bounds, somewhat more; not beyond it.
 
     Where no move keeps the constraint (the charge is at the threshold or below) the ball lies
     beyond the action bounds, in the direction of the waypoint. Where the station is out of reach,
@@ -186,7 +216,7 @@ class BatteryGeometry(PointNavGeometry):
     def constraint_set(self, tensordict: TensorDictBase) -> Ball:
         """Return the ball of allowed moves (docs/method.md, section 4)."""
         position, battery = self.read(tensordict)
-        way = self.path.to_station(position)
+        way = self.way(tensordict)
         steps_left = battery - 1 - self.layout.battery_threshold
         reach = CAUTIOUS * (self.layout.zone_radius + self.layout.step_length * steps_left)
         radius = torch.maximum(reach - way.rest, way.turning_radius) / self.layout.step_length
@@ -204,19 +234,32 @@ class BatteryGeometry(PointNavGeometry):
         )
 
     def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor:
-        """Return the move towards the next waypoint, which is the ball's center."""
-        center = allowed.fields()["center"]
+        """Return the move towards the next waypoint, which is the ball's center.
+
+        Longer than usual where the ball only just reaches into a corner of the action bounds: to
+        where it is as far from the bounds, 1 - t max|u_i|, as from the ball's boundary,
+        r - (length - t).
+        """
+        center, radius = allowed.fields()["center"], allowed.fields()["radius"].unsqueeze(-1)
         length = torch.linalg.vector_norm(center, dim=-1, keepdim=True)
-        return center * (SAFE_SPEED / length.clamp(min=SAFE_SPEED))
+        far = length.clamp(min=SAFE_SPEED)
+        balanced = (1 + length - radius) / (far + center.abs().amax(-1, keepdim=True))
+        return center * torch.maximum(SAFE_SPEED / far, balanced).clamp(max=1)
 
 
 def read_observation(tensordict: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
     """Return positions ``(*batch, 2)`` and charges in whole percent, int64 ``(*batch,)``."""
+    position = read_position(tensordict, key)
+    battery = (tensordict.get(key)[..., 2] * BATTERY_FULL).round().to(torch.int64)
+    return position, battery
+
+
+def read_position(tensordict: TensorDictBase, key: str) -> Tensor:
+    """Return positions ``(*batch, 2)``."""
     observation = tensordict.get(key)
     if observation.shape[-1] != 5:
         raise GeometryError(
             f"key {key!r}: expected (x, y, battery / {BATTERY_FULL}, goal x, goal y), shape "
             f"(*batch, 5), given shape {tuple(observation.shape)}"
         )
-    battery = (observation[..., 2] * BATTERY_FULL).round().to(torch.int64)
-    return observation[..., :2], battery
+    return observation[..., :2]

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import embedding
 
 from cnfp_torchrl.tasks.point_nav.layout import Layout
 
@@ -43,6 +44,8 @@ class StationWay(NamedTuple):
     separates: Tensor
     """Which sides (x_low, y_low, x_high, y_high) of each rectangle separate it from both the
     position and the waypoint, bool ``(*batch, R, 4)``; all false where no way was found."""
+    side_distances: Tensor
+    """The position's `side_distances`, ``(*batch, R, 4)``."""
     found: Tensor
     """False inside rectangles and where no separable way exists, bool ``(*batch,)``; the waypoint
     is then the station nearest in a straight line."""
@@ -70,6 +73,9 @@ class ShortestPath(nn.Module):
     node_rest: Tensor
     node_turning_radius: Tensor
     node_clear: Tensor
+    node_detours: Tensor
+    side_codes: Tensor
+    first_rows: Tensor
     corners: Tensor
     corner_lengths: Tensor
 
@@ -85,22 +91,25 @@ class ShortestPath(nn.Module):
 
     def to_station(self, position: Tensor) -> StationWay:
         """Return the way to the nearest station from positions ``(*batch, 2)``."""
-        outside = side_distances(position, self.rectangles) > 0
-        separates = outside.unsqueeze(-3) & self.node_clear
-        separable = separates.any(-1).all(-1)
-        distance = torch.linalg.vector_norm(position.unsqueeze(-2) - self.nodes, dim=-1)
-        length = torch.where(separable, distance + self.node_rest, torch.inf)
-        found = length.amin(-1).isfinite()
-        stations = torch.where(self.node_turning_radius > 0, torch.inf, distance)
-        node = torch.where(found, length.argmin(-1), stations.argmin(-1))
-        sides = separates.gather(
-            -3, node[..., None, None, None].expand(*node.shape, 1, *separates.shape[-2:])
-        ).squeeze(-3)
+        distances = side_distances(position, self.rectangles)
+        outside = distances > 0
+        # The sides that a rectangle is seen from tell which nodes are separable from it: looked up,
+        # not compared side by side with each node.
+        seen_from = (outside * self.side_codes).sum(-1) + self.first_rows
+        detours = embedding(seen_from, self.node_detours).sum(-2)
+        x, y = position.unsqueeze(-2).unbind(-1)
+        distance = torch.hypot(x - self.nodes[:, 0], y - self.nodes[:, 1])
+        shortest, node = (distance + self.node_rest + detours).min(-1)
+        found = shortest.isfinite()
+        nearest_station = distance[..., : len(self.layout.stations)].argmin(-1)
+        node = torch.where(found, node, nearest_station)
+        sides = outside & self.node_clear[node] & found[..., None, None]
         return StationWay(
             self.nodes[node],
             self.node_rest[node],
             self.node_turning_radius[node],
-            sides & found[..., None, None],
+            sides,
+            distances,
             found,
         )
 
@@ -160,8 +169,16 @@ class ShortestPath(nn.Module):
             shorter := torch.minimum(rest, (lengths + rest).amin(-1) + turn), rest
         ):
             rest = shorter
+        # Sixteen rows for each rectangle: one for each combination of sides that it is seen from.
+        side_codes = 2 ** torch.arange(4)
+        seen_from = (torch.arange(16).unsqueeze(-1) & side_codes) > 0
+        separable = (seen_from.unsqueeze(1) & clear.movedim(0, 1).unsqueeze(1)).any(-1)
+        detours = torch.where(separable, zero, torch.inf).flatten(0, 1)
         return [
             ("rectangles", rectangles),
+            ("node_detours", detours),
+            ("side_codes", side_codes),
+            ("first_rows", 16 * torch.arange(len(rectangles))),
             ("nodes", nodes),
             ("node_rest", rest),
             ("node_turning_radius", turning_radius),

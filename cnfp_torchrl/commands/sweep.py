@@ -1,0 +1,151 @@
+"""Tell what came of a sweep: the command ``cnfp-sweep``, and the end of ``cnfp-train -m``."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from cnfp_torchrl.commands.extras import needs_extra
+
+with needs_extra("train"):
+    from cnfp_torchrl.commands.paths import quoted
+    from cnfp_torchrl.text_table import text_table
+    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.sweep import SEED, Mean, SweepRun, over_seeds, read_sweep, varied
+    from cnfp_torchrl.visual.figures.sweep import save_sweep
+    from cnfp_torchrl.whole_file import whole_file
+
+TABLE, MEANS, FIGURE = "sweep.csv", "sweep_means.csv", "sweep.png"
+"""The files in the sweep's folder."""
+
+
+def run_rows(runs: Sequence[SweepRun]) -> list[list[str]]:
+    """Return a header and a row for each run."""
+    keys = varied(runs)
+    header = [*keys, "score", "violations", "relaxation", "seconds", "folder", "state"]
+    return [header, *(_run_row(run, keys) for run in runs)]
+
+
+def _run_row(run: SweepRun, keys: Sequence[str]) -> list[str]:
+    numbers = (run.score, run.violations, run.relaxation, run.seconds)
+    state = f"{run.state}: {run.reason}" if run.reason else run.state
+    settings = [run.overrides.get(key, "") for key in keys]
+    return [*settings, *map(_number, numbers), run.path.name, state]
+
+
+def mean_rows(runs: Sequence[SweepRun]) -> list[list[str]]:
+    """Return a header and a row for each setting: means over its seeds, with 95 % intervals."""
+    keys = [key for key in varied(runs) if key != SEED]
+    rows = [[*keys, "runs", "done", "score", "+-", "violations", "relaxation", "seconds"]]
+    for settings, group in over_seeds(runs).items():
+        done = [run for run in group if run.is_done]
+        scores = [run.score for run in done if run.score is not None]
+        mean = Mean.of(scores) if scores else Mean(float("nan"), None)
+        rows.append(
+            [
+                *settings,
+                str(len(group)),
+                str(len(done)),
+                _number(mean.value if scores else None),
+                _number(mean.half_width),
+                _number(_sum([run.violations for run in done])),
+                _number(
+                    max((r.relaxation for r in done if r.relaxation is not None), default=None)
+                ),
+                _number(_sum([run.seconds for run in done])),
+            ]
+        )
+    return rows
+
+
+def _sum(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
+def report(folder: Path) -> str:
+    """Write table, means and figure of a sweep into its folder, and return both tables as text."""
+    runs = read_sweep(folder)
+    tables = {TABLE: run_rows(runs)}
+    if SEED in varied(runs):
+        tables[MEANS] = mean_rows(runs)
+    for name, rows in tables.items():
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(rows)
+        with whole_file(folder / name) as file:
+            file.write(text.getvalue().encode())
+    save_sweep(runs, folder / FIGURE)
+    parts = [text_table(rows) for rows in tables.values()]
+    files = ", ".join(str(folder / name) for name in (*tables, FIGURE))
+    return "\n\n".join([*parts, files])
+
+
+def resume(runs: Sequence[SweepRun], *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[str]:
+    """Go on with the runs that are neither done nor running; yield a line for each when it ends.
+
+    Args:
+        runs: the runs of a sweep.
+        jobs: number of runs at a time, each in a process of its own.
+        trusted: names that their configurations may use, as ``trusted`` of ``cnfp-train``.
+    """
+
+    def go_on(run: SweepRun) -> str:
+        if not RunFolder(run.path).has_started:
+            return f"{run.path}: never began ({run.reason}); start it anew"
+        arguments = [f"resume={quoted(str(run.path.absolute()))}"]
+        if trusted:
+            arguments.append(f"trusted=[{','.join(map(quoted, trusted))}]")
+        done = subprocess.run(
+            [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+        if done.returncode == 0:
+            return f"{run.path}: done"
+        return f"{run.path}: {RunFolder(run.path).load_failure() or done.stderr.strip()}"
+
+    unfinished = [run for run in runs if run.state in ("failed", "stopped")]
+    with ThreadPoolExecutor(jobs) as pool:
+        yield from pool.map(go_on, unfinished)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print and write the table of a sweep, and go on with what is not done if asked to."""
+    parser = argparse.ArgumentParser(
+        prog="cnfp-sweep", description="Tell what came of a sweep of cnfp-train -m."
+    )
+    parser.add_argument("folder", type=Path, help="the sweep's folder, multirun/DATE/TIME")
+    parser.add_argument("--resume", action="store_true", help="go on with runs that are not done")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time (1)")
+    parser.add_argument(
+        "--trusted", action="append", default=[], metavar="NAME", help="see cnfp-train's trusted"
+    )
+    options = parser.parse_args(arguments)
+    if options.jobs < 1:
+        parser.error(f"--jobs: expected a number >= 1, given {options.jobs}")
+    try:
+        if options.resume:
+            runs = read_sweep(options.folder)
+            for line in resume(runs, jobs=options.jobs, trusted=options.trusted):
+                sys.stdout.write(f"{line}\n")
+        sys.stdout.write(f"{report(options.folder)}\n")
+    except (OSError, ValueError) as error:
+        sys.exit(f"cnfp-sweep: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""Sweeps as Hydra starts them: how the runs' folders are called, and which sweeps were started."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+LONGEST = 80
+"""Characters of a folder's name; the number before it keeps names apart that are cut."""
+
+STARTED: list[Path] = []
+"""The folders of the sweeps that this process has started."""
+
+
+class SweepStart(Callback):
+    """Remembers a sweep's folder, for what is told of it at the end, however that comes.
+
+    Hydra itself calls nothing after a sweep with a failed run.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Remember the folder."""
+        STARTED.append(Path(str(config.hydra.sweep.dir)).absolute())
+
+
+def run_name(number: int, overrides: Sequence[str], constant: Sequence[str]) -> str:
+    """Return the name of a run's folder: its number and what was varied, such as ``3_seed-1``.
+
+    Args:
+        number: the run's number in the sweep.
+        overrides: all overrides of the run.
+        constant: the keys that all runs have in common.
+    """
+    varied = (each.lstrip("+~").partition("=") for each in overrides)
+    parts = [
+        f"{re.split('[./@]', key)[-1]}-{_short(value)}"
+        for key, _, value in varied
+        if key not in constant
+    ]
+    # Letters, digits and dots alone, so that neither shell nor Hydra reads anything into a path.
+    name = "_".join([str(number), *(re.sub(r"[^\w.+]+", "-", part).strip("-") for part in parts)])
+    return name[:LONGEST].rstrip("-._")
+
+
+def _short(value: str) -> str:
+    """Return a number with few digits, and everything else as it is."""
+    try:
+        return value if len(value) < 7 else f"{float(value):.4g}"
+    except ValueError:
+        return value
+
+
+# In every process that runs a job: Hydra sends callbacks there, and with them this module.
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def sweep_arguments(arguments: Sequence[str]) -> list[str]:
+    """Return what to add to the arguments of a sweep: the keys that all its runs have in common."""
+    if not {"-m", "--multirun"} & set(arguments):
+        return []
+    constant = []
+    for argument in arguments:
+        try:
+            override = OverridesParser.create().parse_override(argument)
+        except HydraException:
+            continue  # an option, or what Hydra will refuse in its own words
+        if not override.is_sweep_override() and not argument.startswith("hydra"):
+            constant.append(override.get_key_element().lstrip("+~"))
+    if not constant:
+        return []
+    quoted = ",".join(f"'{key}'" for key in constant)
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{quoted}]"]
