@@ -26,6 +26,10 @@ from cnfp_torchrl.visual.snapshot import FlowSnapshot, take_snapshot
 from cnfp_torchrl.visual.states import telling_states
 
 METRICS, FIGURES = "metrics", "figures"
+_TITLES = {
+    "permissive": "Most permissive state that was seen",
+    "restrictive": "State in which constraints bind",
+}
 
 
 def draw_run_figures(
@@ -73,7 +77,7 @@ def _figures(folder: RunFolder, config: DictConfig, episodes: int) -> dict[str, 
         return figures  # the stages of a flow are drawn with their densities
     for kind, state in zip(("permissive", "restrictive"), telling_states(env, head), strict=True):
         snapshot = take_snapshot(actor, state, seed=config.seed)
-        title = f"Most {kind} state that was seen{_openness(snapshot)} · {run}"
+        title = f"{_TITLES[kind]}{_openness(snapshot)} · {run}"
         if snapshot.is_saturated:
             snapshot = snapshot.with_standard_base(config.seed)
             title += "\nthe policy is saturated: samples of N(0, 1) in its place"

@@ -102,21 +102,26 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
         [
             "Map",
             "Legend",
-            "1 · action bounds",
-            "2 · battery",
-            "3 · obstacle, highest priority",
+            "1 · action bounds (→ right, ↑ up)",
+            "2 · battery (→ right, ↑ up)",
+            "3 · obstacle, highest priority (→ right, ↑ up)",
             "What happened in this step",
-            "Reward",
-            "Return so far",
-            "Violations so far",
-            "Battery (%)",
+            "Moved by (action units)",
+            "Allowed before the flow (% of samples)",
+            "Relaxed by (action units)",
+            "Violations so far (steps)",
             "Entropy (nats)",
+            "Reward of a step",
+            "Return so far",
+            "Battery (%)",
+            "Executed action",
+            "Observation",
             *TRAINING_PLOTS,
         ]
     )
     assert not [report for view in views for report in view.reports]
     by_name = {view.name: view.view_id for view in views}
-    for name in ("Map", "3 · obstacle, highest priority"):
+    for name in ("Map", "3 · obstacle, highest priority (→ right, ↑ up)"):
         first, last = (picture(viewer, by_name[name], step) for step in (0, STEPS - 1))
         assert first != last
     assert picture(viewer, by_name[name], 0) == first
