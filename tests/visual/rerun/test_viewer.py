@@ -46,6 +46,7 @@ def opened(viewer: ViewerClient, path: Path, last: int) -> list:
     """Open a recording, wait until it is there to its last step, and return its views."""
     viewer.open(str(path))
     ends = time.monotonic() + PATIENCE_S
+    before: list[str] = []
     while time.monotonic() < ends:
         state = viewer.get_state()
         timelines = [
@@ -54,9 +55,12 @@ def opened(viewer: ViewerClient, path: Path, last: int) -> list:
             if recording.store_id == state.active_recording
             for timeline in recording.timelines
         ]
-        if not state.loading and state.views and any(t.end == last for t in timelines):
+        # The views get other identifiers when the viewer makes the recording's layout its own.
+        now = [view.view_id for view in state.views]
+        is_settled, before = bool(now) and now == before, now
+        if not state.loading and is_settled and any(t.end == last for t in timelines):
             return state.views
-        time.sleep(0.1)
+        time.sleep(0.5)
     raise AssertionError(f"the viewer did not show {path} up to step {last}: {viewer.get_state()}")
 
 
