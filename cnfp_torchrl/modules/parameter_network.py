@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, skip_existing
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 
@@ -16,7 +18,20 @@ class ParameterNetwork(TensorDictModule):
     tensordict 0.14 looks on disk for pandas at each entry that its module writes, lest it be a data
     frame, which takes longer than a small network does. Whatever is not the usual call is left to
     it: tensors in place of a tensordict, missing entries, other outputs than the keys say.
+
+    Args:
+        network: The network, which returns a tensor or a tuple of them.
+        in_keys: The keys of what it reads.
+        out_keys: The keys of what it returns.
     """
+
+    def __init__(
+        self,
+        network: Callable[..., Tensor | tuple[Tensor, ...]],
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+    ) -> None:
+        super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
 
     def forward(
         self, tensordict: TensorDictBase, *args: Any, **kwargs: Any
