@@ -62,3 +62,18 @@ def test_anchors_are_timed_and_tabulated(tmp_path: Path) -> None:
     for row in (holds, relaxed):
         assert 0 < row["/ flow"]["low"] <= row["/ flow"]["ratio"] <= row["/ flow"]["high"]
         assert f"| {row['ms']['anchor']:.2f} |" in text
+
+
+def test_each_line_is_measured_alone_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "lines.py"
+    lines = ["point-nav-step", "own-step", "whole-path", "flow", "anchors"]
+    arguments = ["--line", *lines, "--quick", "--out", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    for line in lines:
+        path = tmp_path / f"lines_{line.replace('-', '_')}.json"
+        document = json.loads(path.read_text())
+        assert {"torch", "torchrl", "tensordict"} <= set(document["about"])
+        for title, rows in document["results"].items():
+            assert f"## {title}" in path.with_suffix(".md").read_text()
+            assert next(iter(rows.values()))["ratio"] == 1
+            assert all(row["low"] <= row["ratio"] <= row["high"] for row in rows.values())
