@@ -216,47 +216,62 @@ class RunFolder:
         with whole_file(self.path / file_name) as file:
             torch.save(state, file)
 
-    def load_checkpoint(self) -> dict[str, Any]:
+    def load_checkpoint(self, name: str = CHECKPOINT) -> dict[str, Any]:
         """Read the state dicts; tensors and plain containers only, so no code can run.
+
+        Args:
+            name: `CHECKPOINT` or `BEST`.
 
         Raises:
             ValueError: when there is none, or it is not a whole checkpoint.
         """
-        path = self.path / CHECKPOINT
+        path = self.path / name
         if not path.is_file():
-            raise self._unusable("is not there")
+            raise self._unusable("is not there", name=name)
         if not path.stat().st_size:
-            raise self._unusable("is empty")
+            raise self._unusable("is empty", name=name)
         # Not from the cause: PyTorch advises to load what it refused in a way that runs code.
         try:
             state = torch.load(path, weights_only=True, map_location="cpu")
         except pickle.UnpicklingError:
-            raise self._unusable("holds something else than tensors and plain containers") from None
+            raise self._unusable(
+                "holds something else than tensors and plain containers", name=name
+            ) from None
         except Exception:  # the readers of its formats fail in any way
-            raise self._unusable("is cut short, or no checkpoint at all") from None
+            raise self._unusable("is cut short, or no checkpoint at all", name=name) from None
         if not isinstance(state, dict):
-            raise self._unusable(f"holds a {type(state).__name__}")
+            raise self._unusable(f"holds a {type(state).__name__}", name=name)
         return state
 
-    def restore(self, **modules: nn.Module) -> None:
+    def restore(self, checkpoint: str = CHECKPOINT, /, **modules: nn.Module) -> None:
         """Give modules the states that `save_checkpoint` wrote under their names.
+
+        Args:
+            checkpoint: `CHECKPOINT` or `BEST`.
+            modules: the modules by their names.
 
         Raises:
             ValueError: when the checkpoint is unusable, or of modules of other names or sizes.
         """
-        state = self.load_checkpoint()
+        state = self.load_checkpoint(checkpoint)
         for name, module in modules.items():
             if name not in state:
-                raise self._unusable(f"has no {name!r}, but {sorted(map(str, state))}")
+                raise self._unusable(
+                    f"has no {name!r}, but {sorted(map(str, state))}", name=checkpoint
+                )
             try:
                 module.load_state_dict(state[name])
             except Exception as error:  # so does what is no state at all
-                raise self._unusable(f"has another {name!r} than {CONFIG}", error) from error
+                raise self._unusable(
+                    f"has another {name!r} than {CONFIG}", error, name=checkpoint
+                ) from error
 
-    def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
+    def _unusable(
+        self, what: str, error: Exception | None = None, *, name: str = CHECKPOINT
+    ) -> ValueError:
         reason = "" if error is None else f" ({type(error).__name__}: {error})"
         return ValueError(
-            f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
+            f"{self.path / name}: expected the checkpoint that training wrote beside "
             f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
         )
