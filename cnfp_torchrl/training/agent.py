@@ -27,7 +27,7 @@ from cnfp_torchrl.modules import (
     require_fit,
 )
 from cnfp_torchrl.objectives import SACLagrangianLoss
-from cnfp_torchrl.training.run_folder import CHECKPOINT, RunFolder
+from cnfp_torchrl.training.run_folder import RunFolder
 
 
 def build_environment(
@@ -191,7 +191,7 @@ def build_loss(
 
 
 def load_actor(
-    folder: RunFolder, config: DictConfig, env: TransformedEnv, checkpoint: str = CHECKPOINT
+    folder: RunFolder, config: DictConfig, env: TransformedEnv
 ) -> SafeProbabilisticTensorDictSequential:
     """Return the trained actor of a run.
 
@@ -199,11 +199,10 @@ def load_actor(
         folder: the run.
         config: the run's configuration, from `RunFolder.load_config`.
         env: an environment of that configuration.
-        checkpoint: the file of the last policy, `CHECKPOINT`, or of the `BEST`.
 
     Raises:
         ValueError: when the run's checkpoint is not that of such an actor.
     """
     actor = build_actor(config, env)
-    folder.restore(checkpoint, actor=actor)
+    folder.restore(actor=actor)
     return actor.eval()

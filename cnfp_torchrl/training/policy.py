@@ -140,10 +140,10 @@ def load_policy(
         ValueError: when its files are broken or do not fit each other.
         PermissionError: when its configuration names what is not trusted.
     """
-    folder = RunFolder.open(run)
+    folder = RunFolder.open(run, BEST if best else CHECKPOINT)
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[1])
-    actor = load_actor(folder, config, env, BEST if best else CHECKPOINT)
+    actor = load_actor(folder, config, env)
     return TrainedPolicy(
         actor, env, deterministic=deterministic, refuse_relaxation=refuse_relaxation
     )

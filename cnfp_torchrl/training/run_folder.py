@@ -33,10 +33,12 @@ class RunFolder:
 
     Args:
         path: the folder.
+        checkpoint: name of the file that policies are read from.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
         self.path = Path(path)
+        self.checkpoint = checkpoint
         self._release: Callable[[], Any] | None = None
 
     def close(self) -> None:
@@ -118,17 +120,21 @@ class RunFolder:
         return (self.path / SUMMARY).is_file()
 
     @classmethod
-    def open(cls, path: str | Path) -> RunFolder:
+    def open(cls, path: str | Path, checkpoint: str = CHECKPOINT) -> RunFolder:
         """Return the folder of a finished run.
+
+        Args:
+            path: the folder.
+            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
         """
-        folder = cls(path)
-        missing = [n for n in (CONFIG, CHECKPOINT) if not (folder.path / n).is_file()]
+        folder = cls(path, checkpoint)
+        missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
         if missing:
             raise FileNotFoundError(
-                f"run: expected the folder of a finished run with {CONFIG} and {CHECKPOINT}, but "
+                f"run: expected the folder of a finished run with {CONFIG} and {checkpoint}, but "
                 f"{folder.path} lacks {missing}; give the folder that training printed when it "
                 f"ended, finish the run with cnfp-train resume={folder.path}, or train again"
             )
@@ -216,62 +222,47 @@ class RunFolder:
         with whole_file(self.path / file_name) as file:
             torch.save(state, file)
 
-    def load_checkpoint(self, name: str = CHECKPOINT) -> dict[str, Any]:
+    def load_checkpoint(self) -> dict[str, Any]:
         """Read the state dicts; tensors and plain containers only, so no code can run.
-
-        Args:
-            name: `CHECKPOINT` or `BEST`.
 
         Raises:
             ValueError: when there is none, or it is not a whole checkpoint.
         """
-        path = self.path / name
+        path = self.path / self.checkpoint
         if not path.is_file():
-            raise self._unusable("is not there", name=name)
+            raise self._unusable("is not there")
         if not path.stat().st_size:
-            raise self._unusable("is empty", name=name)
+            raise self._unusable("is empty")
         # Not from the cause: PyTorch advises to load what it refused in a way that runs code.
         try:
             state = torch.load(path, weights_only=True, map_location="cpu")
         except pickle.UnpicklingError:
-            raise self._unusable(
-                "holds something else than tensors and plain containers", name=name
-            ) from None
+            raise self._unusable("holds something else than tensors and plain containers") from None
         except Exception:  # the readers of its formats fail in any way
-            raise self._unusable("is cut short, or no checkpoint at all", name=name) from None
+            raise self._unusable("is cut short, or no checkpoint at all") from None
         if not isinstance(state, dict):
-            raise self._unusable(f"holds a {type(state).__name__}", name=name)
+            raise self._unusable(f"holds a {type(state).__name__}")
         return state
 
-    def restore(self, checkpoint: str = CHECKPOINT, /, **modules: nn.Module) -> None:
+    def restore(self, **modules: nn.Module) -> None:
         """Give modules the states that `save_checkpoint` wrote under their names.
-
-        Args:
-            checkpoint: `CHECKPOINT` or `BEST`.
-            modules: the modules by their names.
 
         Raises:
             ValueError: when the checkpoint is unusable, or of modules of other names or sizes.
         """
-        state = self.load_checkpoint(checkpoint)
+        state = self.load_checkpoint()
         for name, module in modules.items():
             if name not in state:
-                raise self._unusable(
-                    f"has no {name!r}, but {sorted(map(str, state))}", name=checkpoint
-                )
+                raise self._unusable(f"has no {name!r}, but {sorted(map(str, state))}")
             try:
                 module.load_state_dict(state[name])
             except Exception as error:  # so does what is no state at all
-                raise self._unusable(
-                    f"has another {name!r} than {CONFIG}", error, name=checkpoint
-                ) from error
+                raise self._unusable(f"has another {name!r} than {CONFIG}", error) from error
 
-    def _unusable(
-        self, what: str, error: Exception | None = None, *, name: str = CHECKPOINT
-    ) -> ValueError:
+    def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
         reason = "" if error is None else f" ({type(error).__name__}: {error})"
         return ValueError(
-            f"{self.path / name}: expected the checkpoint that training wrote beside "
+            f"{self.path / self.checkpoint}: expected the checkpoint that training wrote beside "
             f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
         )

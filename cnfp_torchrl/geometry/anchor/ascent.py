@@ -243,7 +243,7 @@ class Ascent:
     def _last(self, value: Tensor, events: int = 1) -> Tensor:
         """Return values ``(*batch, *event)`` as ``(*event, B)``."""
         event = value.shape[value.ndim - events :]
-        flat = value.expand(*self.shape, *event).reshape(-1, *event)
+        flat = value.expand((*self.shape, *event)).reshape(-1, *event)
         return flat.movedim(0, -1).contiguous()
 
 

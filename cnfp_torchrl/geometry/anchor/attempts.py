@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
-from cnfp_torchrl.geometry.anchor.depth import row_depths
+from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
 STEPS = 6
@@ -58,29 +58,50 @@ class Attempt(NamedTuple):
     upper: Tensor
     decided: Tensor
 
-    def select(self, index: Tensor) -> Attempt:
-        """Return some of the batch elements, by their flat indices."""
+    def select(self, index: Tensor | None = None) -> Attempt:
+        """Return some batch elements, by their flat indices, or all of them, side by side."""
         shape, dim = self.decided.shape, self.anchor.shape[-1]
-        return Attempt(
-            self.anchor.reshape(-1, dim)[index],
-            self.upper.expand(shape).reshape(-1)[index],
-            self.decided.reshape(-1)[index],
-        )
+        anchor = self.anchor.reshape(-1, dim)
+        upper, decided = self.upper.expand(shape).reshape(-1), self.decided.reshape(-1)
+        if index is None:
+            return Attempt(anchor, upper, decided)
+        return Attempt(anchor[index], upper[index], decided[index])
+
+    def view(self, shape: torch.Size) -> Attempt:
+        """Return what lies side by side in a batch shape."""
+        anchor = self.anchor.view(*shape, self.anchor.shape[-1])
+        return Attempt(anchor, self.upper.view(shape), self.decided.view(shape))
 
 
 def first_attempt(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], candidate: Tensor | None
 ) -> Attempt:
     """Try the middle of all bounding boxes, 0, and points between a candidate and the middle."""
-    boxes = [constraint_set.bounding_box() for constraint_set in sets]
-    low = torch.stack(torch.broadcast_tensors(*(box.low for box in boxes))).amax(0)
-    high = torch.stack(torch.broadcast_tensors(*(box.high for box in boxes))).amin(0)
+    low, high = _bounding_box(sets)
     middle = (low + high) / 2
     points = [middle, torch.zeros_like(middle).clamp(low, high)]
     if candidate is not None:
         points += [torch.lerp(candidate, middle, share) for share in (0.0, 0.25, 0.5, 0.75)]
     # No point has more slack than the middle of all boxes has in the boxes.
     return _roomiest(sets, depths, points, (high - low).amin(-1) / 2)
+
+
+def no_attempt(sets: Sequence[ConstraintSet]) -> Attempt:
+    """Return the middle of all bounding boxes, untried: where steps inwards begin by trying it."""
+    low, high = _bounding_box(sets)
+    bounds, shape = bounds_of(sets), broadcast_shape(*(s.batch_shape for s in sets))
+    middle = ((low + high) / 2).clamp(bounds.low, bounds.high).expand(*shape, bounds.dim)
+    undecided = torch.zeros(shape, dtype=torch.bool, device=middle.device)
+    return Attempt(middle, (high - low).amin(-1) / 2, undecided)
+
+
+def _bounding_box(sets: Sequence[ConstraintSet]) -> tuple[Tensor, Tensor]:
+    """Return bounds of all sets."""
+    boxes = [constraint_set.bounding_box() for constraint_set in sets]
+    low, high = boxes[0]
+    for box in boxes[1:]:
+        low, high = torch.maximum(low, box.low), torch.minimum(high, box.high)
+    return low, high
 
 
 def further_attempt(
@@ -98,32 +119,51 @@ def refined_attempt(
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
-        sets: sets of batch shape ``(B,)``.
-        depths: depths of their rows (`row_depths`), ``(B, m)`` for each set.
-        before: attempt to start from.
+        sets: sets of batch shapes that broadcast.
+        depths: depths of their rows (`row_depths`), ``(*batch, m)`` for each set.
+        before: attempt to start from, ``(*batch,)``.
+
+    Returns:
+        The attempts in all states, side by side.
     """
-    anchor, upper, decided = (value.clone() for value in before)
-    left = torch.arange(len(decided), device=decided.device)
+    anchor, upper, decided = before
+    left: Tensor | None = None
+    shape = before.decided.shape
     for steps in REFINEMENTS:
         ascent = Ascent(sets, before.anchor, before.upper)
         if ascent.sees_all:
-            largest = torch.stack([depth.amax(-1) for depth in depths]).amax(0)
+            largest = depths[0].amax(-1)
+            for depth in depths[1:]:
+                largest = torch.maximum(largest, depth.amax(-1))
             deep = ascent.run_until(steps, SHARE, largest)
             found = Attempt(ascent.point, ascent.bound, deep)
-            impossible = found.upper < -largest
+            impossible = (found.upper < -largest).flatten()
         else:
             found = further_attempt(sets, depths, before, steps)
-            impossible = torch.zeros_like(found.decided)
-        anchor[left], upper[left], decided[left] = found
+            impossible = torch.zeros_like(found.decided).flatten()
+        found = found.select()
+        if left is None:
+            anchor, upper, decided = found
+        else:
+            anchor[left], upper[left], decided[left] = found
+        if bool(found.decided.all()):
+            break
         hard = (~found.decided & ~impossible).nonzero().squeeze(-1)
         if not len(hard):
             break
-        if len(hard) < len(left):
-            sets = [s.select(found.decided.shape, hard) for s in sets]
-            depths = [depth[hard] for depth in depths]
-            left, found = left[hard], found.select(hard)
-        before = found
+        sets, depths = select_states(sets, depths, shape, hard)
+        left, before = hard if left is None else left[hard], found.select(hard)
+        shape = before.decided.shape
     return Attempt(anchor, upper, decided)
+
+
+def select_states(
+    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], shape: torch.Size, index: Tensor
+) -> tuple[list[ConstraintSet], list[Tensor]]:
+    """Return sets and depths of some states, by their flat indices in a batch shape."""
+    some = [depth.expand(*shape, depth.shape[-1]) for depth in depths]
+    some = [depth.reshape(-1, depth.shape[-1])[index] for depth in some]
+    return [s.select(shape, index) for s in sets], some
 
 
 def _roomiest(
@@ -140,5 +180,7 @@ def _roomiest(
     )
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
-    anchor = stacked.take_along_dim(best.unsqueeze(-1), 0).squeeze(0)
+    # Not take_along_dim, with which an exported program would be one for a single batch size.
+    index = best.unsqueeze(-1).expand(1, *shape, stacked.shape[-1])
+    anchor = stacked.gather(0, index).squeeze(0)
     return Attempt(anchor, upper, (room.squeeze(0) >= 0) & (slack >= SHARE * upper))

@@ -22,7 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.attempts import Attempt, first_attempt, refined_attempt
+from cnfp_torchrl.geometry.anchor.attempts import (
+    Attempt,
+    first_attempt,
+    no_attempt,
+    refined_attempt,
+    select_states,
+)
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
@@ -72,6 +78,8 @@ def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None)
         candidate: points that may lie in all sets, ``(*batch, d)``.
     """
     depths = row_depths(sets)
+    if candidate is None and all(map(_is_described, sets)):
+        return Begun(sets, depths, no_attempt(sets))
     return Begun(sets, depths, first_attempt(sets, depths, candidate))
 
 
@@ -115,20 +123,25 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
     sets, depths, found = begun
     bounds = bounds_of(sets)
-    shape, dim = found.decided.shape, found.anchor.shape[-1]
-    anchor, active, relaxation = begun.all_held()
-    anchor = anchor.reshape(-1, dim)
-    left = (~found.decided).flatten().nonzero().squeeze(-1)
+    shape = found.decided.shape
+    _, active, relaxation = begun.all_held()
+    found = found.select()
+    anchor = found.anchor
+    left = (~found.decided).nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
-        sets = [s.select(shape, left) for s in sets]
-        depths = [_flat(depth, shape)[left] for depth in depths]
-        found = refined_attempt(sets, depths, found.select(left))
-        anchor = anchor.index_copy(0, left, found.anchor)
-        hard = (~found.decided).nonzero().squeeze(-1)
-        sets = [s.select(found.decided.shape, hard) for s in sets]
-        depths = [depth[hard] for depth in depths]
-        found, left = found.select(hard), left[hard]
+        some = shape
+        if len(left) < len(anchor):
+            sets, depths = select_states(sets, depths, shape, left)
+            some, found = left.shape, found.select(left)
+        refined = refined_attempt(sets, depths, found.view(some))
+        anchor = anchor.index_copy(0, left, refined.anchor)
+        if bool(refined.decided.all()):
+            left = left[:0]
+        else:
+            hard = (~refined.decided).nonzero().squeeze(-1)
+            sets, depths = select_states(sets, depths, some, hard)
+            found, left = refined.select(hard), left[hard]
     if len(left):
         margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
         searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.anchor, found.upper)
@@ -139,7 +152,7 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
         for amount, found_amount in zip(relaxation, searched.relaxation, strict=True):
             flat = amount.view(-1, amount.shape[-1])
             flat.index_copy_(0, left, (up * found_amount).to(amount))
-    return Anchored(anchor.view(*shape, dim), active, relaxation)
+    return Anchored(anchor.view(*shape, anchor.shape[-1]), active, relaxation)
 
 
 def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> Tensor:
@@ -196,6 +209,13 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Cheby
     best = everything.maximize(np.zeros(rows.shape), rows, rows, middle, settled)
     like = next(iter(sets[0].fields().values()))
     return ChebyshevCenter(*(torch.from_numpy(value).to(like.device) for value in best))
+
+
+def _is_described(constraint_set: ConstraintSet) -> bool:
+    """Tell whether steps inwards see all of a set, so that they can do without a first attempt."""
+    kind = type(constraint_set)
+    described = kind.superlevel is not ConstraintSet.superlevel
+    return described and kind.part_near is ConstraintSet.part_near
 
 
 def _flat(rows: Tensor, shape: torch.Size) -> Tensor:

@@ -104,7 +104,9 @@ class Search:
         left = (possible if all(self.everything.convex) else ~fits).nonzero()[0]
         if len(left):
             some = Search(self.everything.select(left), self.depth[left], self.leeway[left])
-            some.kept = start[left]
+            # From afar, as float64 sees it, nothing can be told of what is near.
+            near = np.abs(start[left] - some.kept) <= some.everything.program.half.T
+            some.kept = np.where(near.all(-1, keepdims=True), start[left], some.kept)
             fits[left] = some._fit(~some.far)
             self.kept[left] = some.kept
         # Far rows hold or give way wherever the anchor is.
