@@ -33,6 +33,8 @@ OPTIONS = sorted(
     for path in config_directory().glob("*/**/*.yaml")
     # Those that need a viewer, a port or a display have tests of their own.
     if path.parent.name != "visual" or path.stem in ("off", "file")
+    # Those that start processes, too.
+    if path.parent.name != "collector" or path.stem == "single"
     # Those of another algorithm than the default are parts of its option.
     if path.stem not in ("ppo", "td3", "deterministic", "state_value")
     or path.parent.name == "algorithm"

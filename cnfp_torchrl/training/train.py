@@ -31,6 +31,7 @@ from cnfp_torchrl.training.callbacks import (
     give_episodes,
 )
 from cnfp_torchrl.training.checkpoints import Attributes
+from cnfp_torchrl.training.collectors import make_collector, shutting_down
 from cnfp_torchrl.training.constraint_counts import (
     ConstraintTally,
     constraint_reports,
@@ -96,7 +97,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     learner: Learner = instantiate(config.algorithm, _partial_=True)(
         config, env, actor, folder.path / STATES if is_saved else None
     )
-    collector = instantiate(config.collector, _partial_=True)(env, learner.policy)
+    collector = make_collector(config, env, learner.policy)
     learner.begin()
 
     # Callback and loggers
@@ -162,7 +163,11 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             )
 
     with closing(callback), closing(evaluations):
-        with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+        with (
+            closing(metrics),
+            shutting_down(collector),
+            StopRequest(STOP_SIGNALS if is_saved else ()) as stop,
+        ):
             for collected in collector:
                 callback.on_batch(collected)
                 metrics.add_steps(collected.reshape(-1))
@@ -180,7 +185,6 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
             metrics.finish()
-        collector.shutdown()
         # Before anything else that may fail or be interrupted.
         folder.save_checkpoint(**trained)
 
