@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -13,6 +15,13 @@ from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.region import Region
+from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum
+
+Projector: TypeAlias = Callable[[Tensor], Tensor]
+"""From points ``(*batch, d)`` to the closest ones of a set."""
+
+NEWTON_STEPS = 8
+"""Steps of Newton's method onto a cone: rounding error where axes differ by up to some 30 times."""
 
 
 def onto_box(box: Box, point: Tensor) -> Tensor:
@@ -46,34 +55,105 @@ def onto_half_space(half_space: HalfSpaces, point: Tensor) -> Tensor:
     return point - excess * normal / square.masked_fill(square == 0, 1)
 
 
-PROJECTIONS: dict[type[ConstraintSet], Callable[..., Tensor]] = {
-    Box: onto_box,
-    Ball: onto_ball,
-    HalfSpaces: onto_half_space,
-}
-"""Closed-form projections of a point, by family; others may be added."""
+def onto_kinked_sum(total: KinkedSum, point: Tensor) -> Tensor:
+    """Return the closest point of a bounded sum, see `onto_box_and_kinked_sum`."""
+    everywhere = torch.full_like(point, torch.inf)
+    return onto_box_and_kinked_sum(Box(-everywhere, everywhere, validate_args=False), total, point)
 
 
-def project(constraint_set: ConstraintSet, point: Tensor) -> Tensor:
-    r"""Return the closest point of a set, :math:`\arg\min_{a \in C} |a - p|`, in closed form.
+def onto_box_and_kinked_sum(box: Box, total: KinkedSum, point: Tensor) -> Tensor:
+    r"""Return the closest point of the intersection of a box and a bounded sum of kinked terms.
 
-    Args:
-        constraint_set: set of a family in `PROJECTIONS`.
-        point: points p, ``(*batch, d)``.
-
-    Raises:
-        TypeError: when the family has no closed-form projection.
+    By the optimality conditions it is :math:`a(\lambda)` with the smallest :math:`\lambda \ge 0`
+    for which the sum is within its bound, where :math:`a_i(\lambda) = p_i - \lambda g_i`, with the
+    slope :math:`g_i` of its side, as long as that lies in the box and has not reached 0; there it
+    stops. The sum falls with :math:`\lambda` and is linear between 2 d kinks. Takes O(d^2).
     """
-    # A plain look-up, not functools.singledispatch, which torch.compile cannot trace.
-    projection = PROJECTIONS.get(type(constraint_set))
-    if projection is None:
-        raise TypeError(
-            "expected a set with a closed-form projection, one of "
-            f"{[family.__name__ for family in PROJECTIONS]}, given "
-            f"{type(constraint_set).__name__}; use the exact flow (flow=exact), which takes every "
-            "family"
+    slope = torch.where(point > 0, total.upper, total.lower)
+    clamped = point.clamp(box.low, box.high)
+    with torch.no_grad():
+        # Where each component begins to move, and where it ceases to: at 0, or at the box's bound
+        # before it. Towards 0 means down for positive components, up for negative ones.
+        sign, size, steep = point.sign(), point.abs(), slope.abs()
+        far = torch.where(point > 0, box.high, -box.low)
+        near = torch.where(point > 0, box.low, -box.high).clamp(min=0)
+        moves = (steep > 0) & (size > near) & (far > near)
+        safe = torch.where(moves, steep, 1.0)
+        begins = torch.where(moves, (size - far).clamp(min=0) / safe, torch.inf)
+        ceases = torch.where(moves, (size - near) / safe, torch.inf)
+        kinks = torch.cat([torch.zeros_like(begins[..., :1]), begins, ceases], -1)
+        kinks = kinks.masked_fill(kinks.isinf(), 0)
+        still = torch.maximum(total.upper * clamped, total.lower * clamped)
+        reached = (size.unsqueeze(-2) - kinks.unsqueeze(-1) * steep.unsqueeze(-2)).clamp(
+            min=near.unsqueeze(-2)
         )
-    return projection(constraint_set, point)
+        reached = torch.minimum(reached, far.unsqueeze(-2)) * steep.unsqueeze(-2)
+        terms = torch.where(moves.unsqueeze(-2), reached, still.unsqueeze(-2))
+        exceeds = terms.sum(-1) > total.size.unsqueeze(-1)
+        last = torch.where(exceeds, kinks, -1.0).amax(-1, keepdim=True)
+        moving = moves & (begins <= last) & (last < ceases)
+        binds = moving.any(-1, keepdim=True) & (last >= 0)
+        ceased = moves & (last >= ceases)
+        fixed = torch.where(ceased, near * steep, still).masked_fill(moving, 0)
+        room = total.size.unsqueeze(-1) - fixed.sum(-1, keepdim=True)
+    along = slope * moving
+    square = torch.where(binds, along.square().sum(-1, keepdim=True), 1.0)
+    multiplier = ((along * point).sum(-1, keepdim=True) - room) / square
+    stopped = torch.where(ceased, sign * near, clamped)
+    return torch.where(moving & binds, point - multiplier * slope, stopped)
+
+
+def cone_projector(cone: Cone) -> Projector:
+    r"""Return the projection onto the ellipsoid or cylinder :math:`\{a : |W a + y| \le h\}`.
+
+    In the basis of :math:`W^T W`, with squared singular values :math:`s_i^2`, the closest point's
+    :math:`W a + y` has components :math:`m_i / (1 + \lambda s_i^2)`, m those at the point. Its
+    length falls with :math:`\lambda`; the root where it is h is found by Newton's method on the
+    inverse of the length, from the left (Moré 1977), and has the derivative of the implicit
+    function in the point. What the set itself depends on gets no gradient.
+    """
+    with torch.no_grad():
+        matrix, vector = cone.matrix.detach(), cone.vector.detach()
+        squares, basis = torch.linalg.eigh(matrix.mT @ matrix)
+        squares = squares.clamp(min=0)
+        floor = torch.finfo(squares.dtype).eps * squares.amax(-1, keepdim=True)
+        counts = squares > floor
+        singular = squares.where(counts, 0).sqrt()
+        images = matrix @ basis
+        shift = (images * vector.unsqueeze(-1)).sum(-2) / singular.where(counts, 1)
+        shift = shift.where(counts, 0)
+        beyond = (vector.square().sum(-1) - shift.square().sum(-1)).clamp(min=0)
+        # A set thinner than rounding error is taken as thick as that, so that the root is finite.
+        least = torch.finfo(squares.dtype).eps * cone.size
+        radius = (cone.size.square() - beyond).clamp(min=least.square()).sqrt().unsqueeze(-1)
+    return partial(_onto_cone, singular, basis, shift, radius)
+
+
+def _onto_cone(
+    singular: Tensor, basis: Tensor, shift: Tensor, radius: Tensor, point: Tensor
+) -> Tensor:
+    turned = (basis * point.unsqueeze(-1)).sum(-2)
+    image = singular * turned + shift
+    squares = singular.square()
+    with torch.no_grad():
+        size = vector_norm(image, dim=-1, keepdim=True)
+        outside = size > radius
+        tiny = torch.finfo(point.dtype).tiny ** 0.5
+        multiplier = torch.zeros_like(radius + size)
+        for _ in range(NEWTON_STEPS):
+            shrunk = image / (1 + multiplier * squares)
+            length = vector_norm(shrunk, dim=-1, keepdim=True)
+            bend = (shrunk.square() * squares / (1 + multiplier * squares)).sum(-1, keepdim=True)
+            step = (length / radius.clamp(min=tiny) - 1) * length.square() / bend.clamp(min=tiny)
+            multiplier = multiplier + torch.where(outside, step, 0.0)
+        shrunk = image / (1 + multiplier * squares)
+        bend = (shrunk.square() * squares / (1 + multiplier * squares)).sum(-1, keepdim=True)
+        weight = torch.where(outside, shrunk / (1 + multiplier * squares), 0.0)
+    # 0 in value; by it the multiplier has the derivative of the implicit function.
+    follows = (weight * (image - image.detach())).sum(-1, keepdim=True)
+    multiplier = multiplier + follows / torch.where(outside, bend, 1.0)
+    back = (turned - multiplier * singular * shift) / (1 + multiplier * squares)
+    return torch.where(outside, (basis * back.unsqueeze(-2)).sum(-1), point)
 
 
 def onto_box_and_ball(box: Box, ball: Ball, point: Tensor) -> Tensor:
@@ -109,13 +189,63 @@ def onto_box_and_ball(box: Box, ball: Ball, point: Tensor) -> Tensor:
     return ball.center + (share * offset).clamp(low, high)
 
 
+PROJECTIONS: dict[type[ConstraintSet], Callable[..., Tensor]] = {
+    Box: onto_box,
+    Ball: onto_ball,
+    HalfSpaces: onto_half_space,
+}
+"""Closed-form projections of a point, by family; others may be added."""
+
+
+def projector(constraint_set: ConstraintSet) -> Projector:
+    """Return the projection onto a set, with all that points share computed once.
+
+    By the closed form of its family in `PROJECTIONS`, else by the set's `superlevel`, so that every
+    family that describes itself has a projection.
+
+    Args:
+        constraint_set: a set; of a non-convex one, what `superlevel` describes of it.
+
+    Raises:
+        TypeError: for a family that has neither.
+    """
+    # A plain look-up, not functools.singledispatch, which torch.compile cannot trace.
+    closed = PROJECTIONS.get(type(constraint_set))
+    if closed is not None:
+        return partial(closed, constraint_set)
+    described = constraint_set.superlevel()
+    if isinstance(described, KinkedSum):
+        return partial(onto_kinked_sum, described)
+    if isinstance(described, Cone):
+        return cone_projector(described)
+    raise TypeError(
+        "expected a set with a projection, one of "
+        f"{[family.__name__ for family in PROJECTIONS]} or one whose `superlevel` is a Cone or a "
+        f"KinkedSum, given {type(constraint_set).__name__}; use the exact flow (flow=exact), which "
+        "takes every family"
+    )
+
+
+def project(constraint_set: ConstraintSet, point: Tensor) -> Tensor:
+    r"""Return the closest point of a set, :math:`\arg\min_{a \in C} |a - p|`.
+
+    Args:
+        constraint_set: set of a family in `PROJECTIONS`, or with a `superlevel`.
+        point: points p, ``(*batch, d)``.
+
+    Raises:
+        TypeError: when the family has no projection.
+    """
+    return projector(constraint_set)(point)
+
+
 def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Tensor:
     r"""Return the closest point of the intersection of a region's active sets, or nearly so.
 
     Boxes count as one set, because the intersection of boxes is a box; half-spaces count row by
-    row. A box alone and a box with one ball are exact, up to rounding. Other intersections take
-    Dykstra's algorithm, in which each set in turn projects the point plus its own correction,
-    :math:`x \leftarrow P_k(x + p_k)`, and keeps what the projection took away,
+    row. A box alone, or with one ball, weighted L1 ball or positive part, is exact, up to rounding.
+    Other intersections take Dykstra's algorithm, in which each set in turn projects the point plus
+    its own correction, :math:`x \leftarrow P_k(x + p_k)`, and keeps what the projection took away,
     :math:`p_k \leftarrow x + p_k - P_k(x + p_k)`. The error falls with the number of rounds, slowly
     where boundaries meet at a small angle. The result may lie outside by that error; a retraction
     towards the anchor moves it inside (`cnfp_torchrl.bijectors.Projection`).
@@ -124,31 +254,55 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
     convex sets in Hilbert spaces".
 
     Args:
-        region: region of sets with closed-form projections; its anchor is not used.
+        region: region of sets that have a `projector`; its anchor is not used.
         point: points ``(*batch, d)``.
         rounds: number of rounds of Dykstra's algorithm, >= 1.
 
     Raises:
-        TypeError: for a set without closed-form projection.
+        TypeError: for a set without projection.
     """
     box, others = _split(region)
     if not others:
         return onto_box(box, point)
-    if len(others) == 1 and isinstance(ball := others[0][0], Ball):
-        active = others[0][1]
-        if active is None:
-            return onto_box_and_ball(box, ball, point)
-        return torch.where(active, onto_box_and_ball(box, ball, point), onto_box(box, point))
-    # The box comes last, not first, so that the action bounds hold after too few rounds.
-    parts = [*others, (box, None)]
+    # The box comes last, not first, so that the action bounds hold after too few rounds; with it
+    # one set that has a closed form together with it.
+    joint = next((i for i, (part, _) in enumerate(others) if _joins_box(part)), None)
+    last = (partial(onto_box, box), None) if joint is None else _with_box(box, *others.pop(joint))
+    if not others:
+        return last[0](point)
+    parts = [*((projector(part), active) for part, active in others), last]
     corrections = [torch.zeros_like(point)] * len(parts)
     for _ in range(rounds):
-        for k, (part, active) in enumerate(parts):
+        for k, (onto, active) in enumerate(parts):
             moved = point + corrections[k]
-            projected = project(part, moved)
+            projected = onto(moved)
             point = projected if active is None else torch.where(active, projected, moved)
             corrections[k] = moved - point
     return point
+
+
+def _joins_box(part: ConstraintSet) -> bool:
+    """Tell whether there is a closed form for a set's intersection with a box."""
+    return isinstance(part, Ball) or isinstance(part.superlevel(), KinkedSum)
+
+
+def _with_box(
+    box: Box, part: ConstraintSet, active: Tensor | None
+) -> tuple[Projector, Tensor | None]:
+    """Return the projection onto a box and a set, where that is active."""
+    if isinstance(part, Ball):
+        both: Projector = partial(onto_box_and_ball, box, part)
+    else:
+        total = part.superlevel()
+        assert isinstance(total, KinkedSum)
+        both = partial(onto_box_and_kinked_sum, box, total)
+    return partial(_where_active, both, box, active), None
+
+
+def _where_active(both: Projector, box: Box, active: Tensor | None, point: Tensor) -> Tensor:
+    if active is None:
+        return both(point)
+    return torch.where(active, both(point), onto_box(box, point))
 
 
 def _split(region: Region) -> tuple[Box, list[tuple[ConstraintSet, Tensor | None]]]:

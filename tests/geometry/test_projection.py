@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,7 +18,10 @@ from cnfp_torchrl.geometry import (
     ConstraintSet,
     Ellipsoid,
     HalfSpaces,
+    PositivePart,
     Region,
+    TaskSpaceBall,
+    VisibleRegion,
     WeightedL1Ball,
     project,
     project_onto_intersection,
@@ -106,6 +110,40 @@ CASES = (
         rounds=300,
         error=1e-4,
     ),
+    Case("weighted L1 ball", (cube(3), WeightedL1Ball(tensor(3.0, -0.5, 0.0), tensor(1.1)[0]))),
+    Case(
+        "weighted L1 ball in a box beside 0",
+        (
+            cube(3),
+            Box(tensor(0.1, -0.9, -2.0), tensor(0.7, -0.2, 0.4)),
+            WeightedL1Ball(tensor(1.0, 1.5, 2.0), tensor(1.3)[0]),
+        ),
+    ),
+    Case("positive part", (cube(3), PositivePart(tensor(2.0, -1.0, 0.7), tensor(0.6)[0]))),
+    Case(
+        "ellipsoid",
+        (cube(2), Ellipsoid(tensor(0.2, -0.1), tensor(0.6, 0, -0.3, 0.2).reshape(2, 2))),
+        rounds=200,
+    ),
+    Case(
+        "task-space ball, unbounded",
+        (
+            cube(3),
+            TaskSpaceBall(
+                tensor(1.0, 0.3, 0, -0.5, 0.8, 0).reshape(2, 3), tensor(0.1, 0.2), tensor(0.4)[0]
+            ),
+        ),
+        rounds=200,
+    ),
+    Case(
+        "limits of power and effort",
+        (
+            cube(3),
+            WeightedL1Ball(tensor(8.0, -5.0, 1.0), tensor(6.0)[0]),
+            TaskSpaceBall(torch.diag(tensor(0.9, -0.2, 0.5)), tensor(0, 0, 0), tensor(0.3)[0]),
+        ),
+        rounds=400,
+    ),
 )
 ALL_CASES = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 EXACT_CASES = pytest.mark.parametrize(
@@ -131,6 +169,17 @@ def by_scipy(case: Case, point: Tensor) -> Tensor:
             case HalfSpaces():
                 finite = np.isfinite(fields["offsets"])
                 return lambda a: (fields["offsets"] - fields["normals"] @ a)[finite]
+            case WeightedL1Ball() | PositivePart():
+                # All half-spaces, one for each choice of a side of every term.
+                sides = (-1, 1) if isinstance(each, WeightedL1Ball) else (0, 1)
+                rows = np.array(list(product(sides, repeat=each.dim))) * fields["weights"]
+                return lambda a: fields["bound"] - rows @ a
+            case Ellipsoid():
+                inverse = np.linalg.inv(fields["scale_tril"])
+                return lambda a: 1 - np.sum((inverse @ (a - fields["center"])) ** 2)
+            case TaskSpaceBall():
+                jacobian, offset = fields["jacobian"], fields["offset"]
+                return lambda a: fields["radius"] ** 2 - np.sum((jacobian @ a + offset) ** 2)
         raise NotImplementedError(type(each).__name__)
 
     found = minimize(
@@ -240,20 +289,16 @@ def test_more_rounds_come_closer() -> None:
     assert errors[-1] < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("each", "given"),
-    [
-        (Ellipsoid(tensor(0, 0), torch.eye(2).double()), "Ellipsoid"),
-        (WeightedL1Ball(tensor(1, 1), tensor(1.0)[0]), "WeightedL1Ball"),
-    ],
-    ids=["ellipsoid", "weighted l1"],
-)
-def test_other_families_are_refused(each: ConstraintSet, given: str) -> None:
-    message = rf"one of \['Box', 'Ball', 'HalfSpaces'\], given {given}; use the exact flow"
+def test_families_that_are_not_convex_are_refused() -> None:
+    walls = VisibleRegion.walls(tensor(-1, -1), tensor(1, 1))
+    region = VisibleRegion(tensor(0, 0), walls, tensor(1.0)[0])
+    message = (
+        r"one of \['Box', 'Ball', 'HalfSpaces'\] or .* given VisibleRegion; use the exact flow"
+    )
     with pytest.raises(TypeError, match=message):
-        project(each, tensor(2, 2))
+        project(region, tensor(2, 2))
     with pytest.raises(TypeError, match=message):
-        project_onto_intersection(Region((cube(2), each), tensor(0, 0)), tensor(2, 2), 1)
+        project_onto_intersection(Region((cube(2), region), tensor(0, 0)), tensor(2, 2), 1)
 
 
 def test_several_rows_have_no_closed_form_of_their_own() -> None:

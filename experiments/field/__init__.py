@@ -1,0 +1,1 @@
+"""The field's tasks: training runs, their records and what they show."""
