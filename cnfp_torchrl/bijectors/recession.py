@@ -59,7 +59,7 @@ class Recession(Bijector):
             must be half-spaces, and the bounds infinite.
         way_out: vectors r of any length, ``(*batch, d)``; None takes the one with the largest
             margin to all rows, minus the point of least length in the hull of their unit normals.
-        scale: scale s of the softness, in action units; with `of_latents` in units of latents.
+        scale: scale s of the softness, in action units; with ``of_latents`` in units of latents.
         sharpness: sharpness of the soft retraction.
         of_latents: whether arguments are in units of the bounds, from -1 to 1, as those of a
             Gaussian policy are, and not in action units.
