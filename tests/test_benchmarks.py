@@ -17,6 +17,16 @@ def test_flows_are_timed_and_tabulated(tmp_path: Path) -> None:
     assert f"{row['exact']['sample']['ratio']:.2f}" in (tmp_path / "flows.md").read_text()
 
 
+def test_distortion_is_measured_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "distortion.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    rows = {row["flow"]: row for row in json.loads((tmp_path / "distortion.json").read_text())}
+    assert rows["soft, p = 2"]["moved"]["max"] < rows["exact (hard)"]["moved"]["max"]
+    assert rows["projection"]["on_boundary"]["share"] > 0.1
+    text = (tmp_path / "distortion.md").read_text()
+    assert all(f"| {name} |" in text for name in rows)
+
+
 def test_the_stream_is_timed_and_tabulated(tmp_path: Path) -> None:
     script = ROOT / "experiments" / "benchmarks" / "stream.py"
     subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)

@@ -102,7 +102,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("flow", ["exact", "gauge", "radial", "squash", "unconstrained"])
+@pytest.mark.parametrize(
+    "flow", ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
+)
 @pytest.mark.parametrize("case", CASES)
 def test_stages_are_the_flows_up_to_each(case: str, flow: str) -> None:
     sets, dim = CASES[case]
