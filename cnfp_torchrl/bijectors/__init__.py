@@ -4,6 +4,7 @@ from cnfp_torchrl.bijectors.bijector import Bijector, Stages, has_latent
 from cnfp_torchrl.bijectors.chain import SquashChain
 from cnfp_torchrl.bijectors.projection import NoDensityError, Projection
 from cnfp_torchrl.bijectors.radial_squash import RadialSquash
+from cnfp_torchrl.bijectors.recession import Recession, require_scale
 from cnfp_torchrl.bijectors.region_squash import ExactSquash, GaugeSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
@@ -27,6 +28,7 @@ __all__ = [
     "NoDensityError",
     "Projection",
     "RadialSquash",
+    "Recession",
     "Retraction",
     "ShellSquash",
     "SoftRetraction",
@@ -36,6 +38,7 @@ __all__ = [
     "has_latent",
     "paper_squash",
     "reach",
+    "require_scale",
     "require_sharpness",
     "well_inside",
 ]

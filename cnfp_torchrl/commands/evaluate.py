@@ -58,7 +58,7 @@ def main(config: DictConfig) -> None:
         settings: EvaluationSettings = instantiate(config.evaluation)
         visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
         trusted = tuple(config.trusted)
-        folder = RunFolder.open(config.run)
+        folder = RunFolder.open(config.run, config.checkpoint)
         directory = Path(HydraConfig.get().runtime.output_dir)
         stream: AbstractContextManager[Any] = nullcontext()
         if visual is not None:
@@ -68,7 +68,13 @@ def main(config: DictConfig) -> None:
             reports = evaluate_run(folder, settings, trusted=trusted)
             output = directory / "evaluation.json"
             write_json(
-                output, {"run": str(folder.path), "seed": settings.seed, "policies": reports}
+                output,
+                {
+                    "run": str(folder.path),
+                    "checkpoint": folder.checkpoint,
+                    "seed": settings.seed,
+                    "policies": reports,
+                },
             )
             sys.stdout.write(f"{evaluation_table(reports)}\n{output}\n")
 

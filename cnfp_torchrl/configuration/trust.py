@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, NoReturn
 
 import yaml
@@ -151,13 +151,19 @@ def locate(name: str) -> Any:
 
 
 @cache
-def _shipped() -> tuple[frozenset[str], frozenset[str]]:
-    """Return every target of the shipped configuration, and every text in it."""
-    contents = [
-        yaml.safe_load(path.read_text(encoding="utf-8"))
-        for path in config_directory().rglob("*.yaml")
-    ]
-    return frozenset(targets(contents)), frozenset(_texts(contents))
+def _shipped() -> tuple[Mapping[str, frozenset[str]], frozenset[str]]:
+    """Return the targets of the shipped configuration by section, and every text in it."""
+    folder = config_directory()
+    found: dict[str, set[str]] = {}
+    texts: set[str] = set()
+    for path in folder.rglob("*.yaml"):
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        group = path.relative_to(folder).parts[0]
+        is_section = group not in (path.name, "experiment")
+        for section, part in [(group, content)] if is_section else content.items():
+            found.setdefault(section, set()).update(targets(part))
+        texts.update(_texts(content))
+    return {name: frozenset(each) for name, each in found.items()}, frozenset(texts)
 
 
 def _texts(content: Any) -> Iterator[str]:
@@ -206,7 +212,7 @@ class _Check:
     Args:
         path: The file.
         trusted: The trusted names, see `require_trusted`.
-        further: The targets that may be named beside `nameable`, with limited arguments.
+        further: The targets that a section may name beside `nameable`, with limited arguments.
         texts: The strings that may be arguments whatever they are like.
     """
 
@@ -214,7 +220,7 @@ class _Check:
         self,
         path: Path,
         trusted: tuple[str, ...],
-        further: frozenset[str] = frozenset(),
+        further: Mapping[str, frozenset[str]] = MappingProxyType({}),
         texts: frozenset[str] = frozenset(),
     ) -> None:
         self.path, self.trusted, self.further, self.texts = path, trusted, further, texts
@@ -272,7 +278,8 @@ class _Check:
                 return True
             if any(target.startswith(f"{name.rstrip('.')}.") for name in self.trusted):
                 return self.require_defined(target, position)
-            if target in nameable() or target in self.further:
+            section = position.lstrip(".").partition(".")[0]
+            if target in nameable() or target in self.further.get(section, ()):
                 return False
         which = " or ".join([*FOREIGN, *(f"what is defined in {name}" for name in self.trusted)])
         self.refuse(position, f"a target that the shipped configuration names, {which}", target)

@@ -15,7 +15,11 @@ from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.previous_action import PreviousAction
 from cnfp_torchrl.envs.relaxation_watch import RelaxedEverywhereWarning
-from cnfp_torchrl.envs.sampled_geometry import SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs.sampled_geometry import (
+    SampledGeometry,
+    amounts_keys,
+    constraints_to_sample,
+)
 from cnfp_torchrl.envs.task_view import (
     NOTHING,
     Boxes,
@@ -55,6 +59,7 @@ __all__ = [
     "Shape",
     "StateSetter",
     "TaskView",
+    "amounts_keys",
     "appended_transforms",
     "constrain_env",
     "constraint_bijectors",

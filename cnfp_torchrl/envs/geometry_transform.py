@@ -156,6 +156,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
             self._family = type(allowed)
         return self._moved_inwards(allowed)
 
+    def entries(self, tensordict: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
+        """Return what is published in some states, without a check, as exported programs need it.
+
+        Args:
+            tensordict: States of any batch size; not changed.
+        """
+        return self._entries(tensordict, self.checked_set(tensordict))
+
     def _validated(self, allowed: ConstraintSet) -> ConstraintSet:
         try:
             return allowed.validate(self.name)

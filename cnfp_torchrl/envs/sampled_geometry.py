@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, Transform
 
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
-from cnfp_torchrl.envs.packed_states import POINTER_BYTES
+from cnfp_torchrl.envs.packed_states import POINTER_BYTES, RARE_BYTES
 from cnfp_torchrl.keys import CONSTRAINTS_KEY, field_key
 from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
@@ -80,13 +80,21 @@ def constraints_to_sample(env: EnvBase, keys: Sequence[NestedKey], limit: int) -
     }
     fields = _fields(env) if _geometries(env) else {}
     sets = {name: sum(sizes.pop(key, 0) for key in fields[name]) for name in fields}
-    stored, sampled = POINTER_BYTES + sum(sizes.values()), []
+    amounts = [sizes.pop(key) for key in amounts_keys(env) if key in sizes]
+    stored = POINTER_BYTES + sum(sizes.values()) + (RARE_BYTES if amounts else 0)
+    sampled = []
     for name in sorted(sets, key=lambda name: -sets[name]):
         if stored + sets[name] <= limit:
             stored += sets[name]
         else:
             sampled.append(name)
     return sampled
+
+
+def amounts_keys(env: EnvBase) -> list[NestedKey]:
+    """Return the keys of constraints' relaxations, which are 0 in most states."""
+    publishes = bool(_geometries(env))
+    return [b.amounts_key for b in constraint_bijectors(env)] if publishes else []
 
 
 def _geometries(env: EnvBase) -> dict[str, GeometryTransform]:

@@ -82,6 +82,11 @@ class Region:
         return self._anchor
 
     @property
+    def has_anchor(self) -> bool:
+        """Whether an anchor is known."""
+        return self._anchor is not None
+
+    @property
     def bounds(self) -> Box:
         """The action bounds, stage 0."""
         bounds = self.sets[0]

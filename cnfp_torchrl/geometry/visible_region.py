@@ -194,8 +194,10 @@ class VisibleRegion(ConstraintSet):
         valid = torch.cat([rising, pair.flatten(-2)], -1)
         slack = offsets - (normals * point[..., None, None, :]).sum(-1)
         best = torch.where(valid, slack, -torch.inf).argmax(-1, keepdim=True)
-        normal = normals.take_along_dim(best.unsqueeze(-1), -2).squeeze(-2)
-        offset = offsets.take_along_dim(best, -1).squeeze(-1)
+        # Not take_along_dim, with which an exported program would be one for a single batch size.
+        row = best.unsqueeze(-1).expand(*best.shape, self.dim)
+        normal = normals.expand(*best.shape[:-1], -1, -1).gather(-2, row).squeeze(-2)
+        offset = offsets.expand(*best.shape[:-1], -1).gather(-1, best).squeeze(-1)
         # In a rectangle the part is empty: 0 a + t <= -1.
         outside = valid.any(-1)
         normal = torch.where(outside.unsqueeze(-1), normal, 0.0)

@@ -79,7 +79,7 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order.
         flow: The rule that combines the sets: a `Flow`, or ``exact``, ``gauge``, ``soft``,
-            ``radial``, ``squash``, ``projection``, ``unconstrained``.
+            ``recession``, ``radial``, ``squash``, ``projection``, ``unconstrained``.
         in_keys: The keys of the Gaussian's location and scale, each ``(*batch, d)``.
         out_key: The key of the action, ``(*batch, d)``.
         return_log_prob: Whether to write the action's log-density ``(*batch,)``, too.

@@ -6,7 +6,7 @@ A flow is a small callable, named by `_target_` in ``conf/flow/`` or by its name
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from cnfp_torchrl.bijectors import (
@@ -17,13 +17,15 @@ from cnfp_torchrl.bijectors import (
     GaugeSquash,
     Projection,
     RadialSquash,
+    Recession,
     SoftRetraction,
     SoftSquash,
     SquashChain,
     paper_squash,
+    require_scale,
     require_sharpness,
 )
-from cnfp_torchrl.geometry import Ball, ConstraintSet, Region
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, Region
 
 
 class Flow(ABC):
@@ -38,8 +40,8 @@ class Flow(ABC):
     takes_actions: ClassVar[bool] = False
     """Whether `of_actions` exists: the flow without a squash before it, for wished actions."""
 
-    reads_anchor: ClassVar[bool] = True
-    """Whether a safe flow takes gauges about the region's anchor."""
+    moves_with_anchor: ClassVar[bool] = True
+    """Whether an anchor moved to an action makes `of_actions` leave that action as it is."""
 
     has_density: ClassVar[bool] = True
     """Whether actions have a log-density; without one, only the reference entropy exists."""
@@ -63,6 +65,10 @@ class Flow(ABC):
             TypeError: when the flow squashes all of R^d instead.
         """
         raise TypeError(f"{type(self).__name__}: expected a flow that takes wished actions")
+
+    def needs_anchor(self, sets: Sequence[ConstraintSet]) -> bool:
+        """Tell whether `of_actions` needs the anchor of a region of some sets."""
+        return True
 
 
 class RegionFlow(Flow):
@@ -127,6 +133,47 @@ class SoftFlow(RegionFlow):
             region,
             sharpness=self.sharpness,
             by_components=self.by_components,
+            validate_args=False,
+        )
+
+
+class RecessionFlow(Flow):
+    """A move along a common way out of all half-spaces, then a soft retraction into the rest.
+
+    For barriers that all have a braking direction in common, which it leaves alone where they are
+    far (`cnfp_torchrl.bijectors.Recession`). Where they have none it is a soft retraction alone.
+
+    Args:
+        scale: The scale of its softness: in action units for wished actions, and for a Gaussian
+            policy in units of half the bounds' width.
+        sharpness: The sharpness of the soft retraction, from 1 to 100.
+    """
+
+    is_safe = True
+    takes_actions = True
+    moves_with_anchor = False
+
+    def __init__(self, scale: float = 1.0, sharpness: float = SHARPNESS) -> None:
+        self.scale, self.sharpness = require_scale(scale), require_sharpness(sharpness)
+
+    def __call__(self, region: Region) -> Recession:
+        return self._recession(region, of_latents=True)
+
+    def of_actions(self, region: Region) -> Recession:
+        return self._recession(region, of_latents=False)
+
+    def needs_anchor(self, sets: Sequence[ConstraintSet]) -> bool:
+        bounds, *others = sets
+        assert isinstance(bounds, Box)
+        unbounded = bool((bounds.low.isinf() & bounds.high.isinf()).all())
+        return not (unbounded and all(isinstance(each, HalfSpaces) for each in others))
+
+    def _recession(self, region: Region, *, of_latents: bool) -> Recession:
+        return Recession(
+            region,
+            scale=self.scale,
+            sharpness=self.sharpness,
+            of_latents=of_latents,
             validate_args=False,
         )
 
@@ -205,6 +252,7 @@ FLOWS: Mapping[str, type[Flow]] = {
     "exact": ExactFlow,
     "gauge": GaugeFlow,
     "soft": SoftFlow,
+    "recession": RecessionFlow,
     "radial": RadialFlow,
     "squash": SquashFlow,
     "projection": ProjectionFlow,

@@ -65,14 +65,14 @@ class ConstraintLayer(nn.Module):
                 region needs an anchor and has none.
         """
         if not isinstance(region, Region):
-            needs = self.flow.reads_anchor
+            needs = self.flow.needs_anchor(region)
             region = Region.build(region) if needs else Region(region)
         for name, given in (("output", output), ("nominal", nominal)):
             if given is not None:
                 _refuse_misfit(name, given, region)
         if nominal is None:
             return self.flow.of_actions(region)(output)
-        if self.flow.reads_anchor:
+        if self.flow.moves_with_anchor:
             region = about(region, nominal, self.room)
         return self.flow.of_actions(region)(nominal + output)
 

@@ -143,14 +143,18 @@ def save_data(path: Path, content: Any) -> None:
 def load_data(path: Path) -> Any:
     """Read what `save_data` wrote; nothing in it is executed, whoever wrote it.
 
+    Tensors come to the device that they were on: a run goes on where it was.
+
     Raises:
-        CheckpointError: when it is not that.
+        CheckpointError: when it is not that, or the device is not there.
     """
     try:
-        return torch.load(path, weights_only=True, map_location="cpu")
+        return torch.load(path, weights_only=True)
     # Not from the cause: PyTorch advises to load what it refused in a way that runs code.
     except Exception as error:  # the readers of its formats fail in any way
         reason = type(error).__name__
+        if "is_available() is False" in str(error):
+            reason = "tensors of a device that is not there"
         raise CheckpointError(
             f"{path}: expected tensors and plain containers, whole as training wrote them, given "
             f"something else ({reason}); copy the file anew from where the run was trained"

@@ -41,15 +41,20 @@ class IntervalEvaluation:
         self.history: list[dict[str, Any]] = []
         """The reports of the evaluations so far, each with its ``step``."""
 
-    def run_if_due(self, frames: int) -> dict[str, Any] | None:
+    def run_if_due(self, frames: int, is_last: bool) -> dict[str, Any] | None:
         """Return the report of an evaluation after this many steps, or None where none is due.
+
+        Args:
+            frames: number of environment steps so far.
+            is_last: whether training ends here, after which the policy is the last candidate for
+                the best one.
 
         Raises:
             FloatingPointError: when a return is not finite.
         """
         interval = self._settings.interval
         before = self.history[-1]["step"] if self.history else 0
-        if interval is None or frames // interval <= before // interval:
+        if interval is None or not (is_last or frames // interval > before // interval):
             return None
         with torch.random.fork_rng():
             if self._env is None:

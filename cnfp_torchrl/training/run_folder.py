@@ -33,10 +33,12 @@ class RunFolder:
 
     Args:
         path: the folder.
+        checkpoint: name of the file that policies are read from.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
         self.path = Path(path)
+        self.checkpoint = checkpoint
         self._release: Callable[[], Any] | None = None
 
     def close(self) -> None:
@@ -118,17 +120,21 @@ class RunFolder:
         return (self.path / SUMMARY).is_file()
 
     @classmethod
-    def open(cls, path: str | Path) -> RunFolder:
+    def open(cls, path: str | Path, checkpoint: str = CHECKPOINT) -> RunFolder:
         """Return the folder of a finished run.
+
+        Args:
+            path: the folder.
+            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
         """
-        folder = cls(path)
-        missing = [n for n in (CONFIG, CHECKPOINT) if not (folder.path / n).is_file()]
+        folder = cls(path, checkpoint)
+        missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
         if missing:
             raise FileNotFoundError(
-                f"run: expected the folder of a finished run with {CONFIG} and {CHECKPOINT}, but "
+                f"run: expected the folder of a finished run with {CONFIG} and {checkpoint}, but "
                 f"{folder.path} lacks {missing}; give the folder that training printed when it "
                 f"ended, finish the run with cnfp-train resume={folder.path}, or train again"
             )
@@ -222,7 +228,7 @@ class RunFolder:
         Raises:
             ValueError: when there is none, or it is not a whole checkpoint.
         """
-        path = self.path / CHECKPOINT
+        path = self.path / self.checkpoint
         if not path.is_file():
             raise self._unusable("is not there")
         if not path.stat().st_size:
@@ -256,7 +262,7 @@ class RunFolder:
     def _unusable(self, what: str, error: Exception | None = None) -> ValueError:
         reason = "" if error is None else f" ({type(error).__name__}: {error})"
         return ValueError(
-            f"{self.path / CHECKPOINT}: expected the checkpoint that training wrote beside "
+            f"{self.path / self.checkpoint}: expected the checkpoint that training wrote beside "
             f"{CONFIG}, but it {what}{reason}; copy both anew from where the run was trained, or "
             "train again"
         )

@@ -63,7 +63,8 @@ class EvaluationSettings:
         seed: seed of the environment and of what policies draw, the same for all of them.
         max_steps: length at which an episode is cut off, for environments that never end one.
         interval: environment steps of training between two evaluations; None evaluates only after.
-        interval_episodes: number of whole episodes of each evaluation during training.
+        interval_episodes: number of whole episodes of each evaluation during training, at most
+            `episodes`.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -80,7 +81,7 @@ class EvaluationSettings:
 
     def at_interval(self) -> EvaluationSettings:
         """Return the settings of the evaluations during training."""
-        return replace(self, episodes=self.interval_episodes)
+        return replace(self, episodes=min(self.interval_episodes, self.episodes))
 
 
 def require_frames(config: DictConfig) -> None:

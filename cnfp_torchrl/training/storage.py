@@ -8,7 +8,12 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import PackedStates, SampledGeometry, constraints_to_sample
+from cnfp_torchrl.envs import (
+    PackedStates,
+    SampledGeometry,
+    amounts_keys,
+    constraints_to_sample,
+)
 from cnfp_torchrl.keys import ACTION_KEY, CONSTRAINTS_KEY, REWARD_KEY
 
 
@@ -23,7 +28,8 @@ def prepare_buffer(
     """Let a buffer store little of constraints; return the keys of transitions to extend it with.
 
     What the actor reads is stored once a state (`PackedStates`), besides sets that are too large:
-    those are computed at sampling (`SampledGeometry`). Without constraints nothing is done.
+    those are computed at sampling (`SampledGeometry`). Relaxations, which are zero in most states,
+    are stored for the states only in which they are not. Without constraints nothing is done.
 
     Args:
         buffer: an empty buffer that overwrites the oldest transitions first.
@@ -36,7 +42,8 @@ def prepare_buffer(
     stored = [key for key in state_keys if key not in computed.field_keys]
     state = list(dict.fromkeys([*computed.state_keys, *stored]))
     if any(isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY for key in state):
-        buffer.append_transform(PackedStates(state, buffer.storage.max_size))
+        rare = amounts_keys(env)
+        buffer.append_transform(PackedStates(state, buffer.storage.max_size, rare))
     if computed.field_keys:
         buffer.append_transform(computed)
     outcome = [("next", key) for key in (*state, REWARD_KEY, "done", "terminated")]

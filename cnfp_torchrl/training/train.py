@@ -132,7 +132,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     best = BestPolicy(folder, **trained)
     episodes = CollectorState(collector, env)
     evaluations = IntervalEvaluation(
-        partial(_evaluation_environment, config, evaluation.interval_episodes),
+        partial(_evaluation_environment, config, evaluation.at_interval().episodes),
         actor,
         evaluation,
         score,
@@ -168,10 +168,10 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 for losses in learner.learn(collected, metrics.frames):
                     metrics.add_losses(losses)
                 metrics.log_if_due()
-                if (report := evaluations.run_if_due(metrics.frames)) is not None:
+                is_last = metrics.frames >= config.collector.total_frames
+                if (report := evaluations.run_if_due(metrics.frames, is_last)) is not None:
                     metrics.add_evaluation(report)
                     best.offer_evaluation(report)
-                is_last = metrics.frames >= config.collector.total_frames
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
                     if evaluation.interval is None:
                         best.offer(*_training_score(metrics, score))

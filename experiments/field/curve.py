@@ -88,7 +88,7 @@ class CurveCallback:
 
     def on_batch(self, batch: TensorDictBase) -> None:
         """Take a batch of transitions ``(agents, time)``."""
-        outcome = batch.get("next")
+        outcome = batch.get("next").select("reward", "done").cpu()
         rewards, ends = (outcome.get(key).squeeze(-1).T for key in ("reward", "done"))
         for reward, done in zip(rewards, ends, strict=True):
             self.curve.add(reward, done)

@@ -17,6 +17,7 @@ from cnfp_torchrl.bijectors import (
     ExactSquash,
     GaugeSquash,
     RadialSquash,
+    Recession,
     Retraction,
     SoftRetraction,
     SoftSquash,
@@ -55,8 +56,8 @@ class Case:
 
     Args:
         name: for the test's id.
-        kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft, soft-rays or
-            soft-alone.
+        kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft, soft-rays,
+            soft-alone or recession.
         sets: in order of application, float64 of values that float32 holds too.
         anchor: of the kinds that have one, ``(*batch, d)``.
         active: which sets hold, ``(*batch, len(sets))``; None means all.
@@ -103,7 +104,7 @@ class Case:
     @property
     def saturates(self) -> bool:
         """Whether the slope far from the anchor is below rounding error, by design."""
-        return self.kind.startswith("soft")
+        return self.kind.startswith(("soft", "recession"))
 
     @property
     def cancellation(self) -> float:
@@ -130,6 +131,8 @@ class Case:
                 return GaugeSquash(self.region(dtype))
             case "radial":
                 return RadialSquash(self.region(dtype))
+            case "recession":
+                return Recession(self.region(dtype), of_latents=True)
             case "soft":
                 return SoftSquash(self.region(dtype))
             case "soft-rays":
@@ -493,6 +496,11 @@ def exact_flows() -> tuple[Case, ...]:
         "dropped-d3-batch",
     ):
         found.append(Case(f"soft-rays-{name}", "soft-rays", *regions()[name]))
+    for name in (
+        *("half-spaces-ball-d1-batch", "half-spaces-l1-d2", "far-d2", "all-families-d3-batch"),
+        *("tight-d2-batch", "mixed-batches-d3"),
+    ):
+        found.append(Case(f"recession-{name}", "recession", *regions()[name]))
     for name in (
         *("bounds-d1", "bounds-d2", "box-ball-d2", "open-box-d2", "half-spaces-l1-d2"),
         *("dropped-d3-batch", "large-d32"),

@@ -20,7 +20,7 @@ from tests.bijectors.test_inside import FAMILIES, LONGER, violations
 
 SHARPNESSES = (1.0, 1.5, 2.0, 4.0, 16.0, 100.0)
 LENGTHS = (1e-12, 1.0, 20.0, 1e3, 1e6, 1e15, 1e30)
-SATURATING = [case for case in CASES if case.saturates]
+SATURATING = [case for case in CASES if case.kind.startswith("soft")]
 
 
 @pytest.mark.parametrize("sharpness", SHARPNESSES)

@@ -97,3 +97,17 @@ def test_runs_that_were_not_finished_go_on_when_asked(tmp_path: Path) -> None:
     for row in (*before, *after):
         del row["seconds"]
     assert before == after
+
+
+@pytest.mark.slow
+def test_a_job_that_slurm_starts_again_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = [*TINY, f"hydra.run.dir={tmp_path / 'run'}"]
+    assert run("train", *arguments, cwd=tmp_path).returncode == 0
+    (tmp_path / "run" / "summary.json").unlink()
+    assert "holds ['config.yaml'" in run("train", *arguments, cwd=tmp_path).stderr
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    again = run("train", *arguments, cwd=tmp_path)
+    assert again.returncode == 0
+    assert "goes on at step 96" in again.stderr

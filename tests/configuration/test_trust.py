@@ -243,6 +243,26 @@ def test_a_strangers_configuration_is_refused(section: str, kind: str, tmp_path:
     assert "trusted=[" in said
 
 
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_strangers_run_is_not_trained_further(kind: str, tmp_path: Path) -> None:
+    content, where = REFUSED[kind]
+    sections: dict[str, Any] = {each: {} for each in BUILT} | {"optim": {"some": content}}
+    (tmp_path / CONFIG).write_text(yaml.safe_dump(sections))
+    with pytest.raises(PermissionError, match=where):
+        RunFolder(tmp_path).load_training_config()
+
+
+@pytest.mark.parametrize(
+    "choice", ["logger=wandb", "visual=connect", "visual=serve", "algorithm=ppo"]
+)
+def test_whatever_is_shipped_can_be_trained_further(
+    choice: str, make_config: Callable[..., DictConfig], tmp_path: Path
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.save_config(make_config(choice))
+    assert folder.load_training_config() == folder.load_settings()
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -306,6 +326,7 @@ def test_every_experiment_is_read_back(
     for section in BUILT:
         assert read[section] == folder.load_settings()[section]
     assert set(targets(OmegaConf.to_container(read))) <= nameable()
+    assert folder.load_training_config() == folder.load_settings()
     assert instantiate(read.env.base, _convert_="all")
 
 

@@ -1,10 +1,11 @@
 """States kept once in a replay buffer: whatever is sampled is what was stored."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from cnfp_torchrl.envs import PackedStates
@@ -55,9 +56,11 @@ def stream(agents: int, steps: int, length: int, *, horizon: int = 1) -> Iterato
         yield transitions(roots, afters)
 
 
-def filled(batches: Iterator[TensorDictBase], size: int) -> tuple[TensorDictReplayBuffer, int]:
+def filled(
+    batches: Iterator[TensorDictBase], size: int, rare: Sequence[NestedKey] = ()
+) -> tuple[TensorDictReplayBuffer, int]:
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(size), batch_size=512)
-    buffer.append_transform(PackedStates(KEYS, size))
+    buffer.append_transform(PackedStates(KEYS, size, rare))
     count = 0
     for batch in batches:
         buffer.extend(batch)
@@ -84,6 +87,48 @@ def test_samples_are_what_was_stored(agents: int, size: int, length: int, horizo
     filled(stream(agents, 60, length, horizon=horizon), size)
 
 
+AMOUNTS = [("constraints", "a", "low"), ("constraints", "point")]
+
+
+def seldom(batches: Iterator[TensorDictBase], every: int) -> Iterator[TensorDictBase]:
+    """Set entries to zero in most states, all but every so many; 0 means in all."""
+    for batch in batches:
+        for part in (batch, batch["next"]):
+            zero = part["number"] % every != 0 if every else torch.ones(len(part)).bool()
+            for key in AMOUNTS:
+                part[key] = part[key].masked_fill(zero.view(-1, *[1] * (part[key].ndim - 1)), 0)
+        yield batch
+
+
+@pytest.mark.parametrize("every", [0, 1, 7])
+@pytest.mark.parametrize("keys", [AMOUNTS, AMOUNTS[1:]])
+@pytest.mark.parametrize(("agents", "size", "horizon"), [(4, 64, 1), (7, 50, 5), (1, 10, 1)])
+def test_rare_entries_are_what_was_stored(
+    every: int, keys: list[NestedKey], agents: int, size: int, horizon: int
+) -> None:
+    batches = list(seldom(stream(agents, 60, 5, horizon=horizon), every))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(size), batch_size=512)
+    buffer.append_transform(PackedStates(KEYS, size, keys))
+    known = {
+        int(part["number"][i]): part[i]
+        for b in batches
+        for part in (b, b["next"])
+        for i in range(len(b))
+    }
+    for batch in batches:
+        buffer.extend(batch)
+    sample = buffer.sample()
+    for part in (sample, sample["next"]):
+        for i, number in enumerate(part["number"].tolist()):
+            for key in KEYS:
+                assert torch.equal(part[key][i], known[number][key])
+    packed = buffer._transform[0]
+    if every == 0:
+        assert packed._rare.end == 0
+    # Of states that are dropped nothing is kept, whatever the length of the run.
+    assert packed._rare.rows is None or len(packed._rare.rows) <= 8 * (size + agents * horizon)
+
+
 def test_batches_of_other_sizes_and_in_another_order_are_right() -> None:
     generator = torch.Generator().manual_seed(1)
     batches = [
@@ -97,7 +142,7 @@ def test_batches_of_other_sizes_and_in_another_order_are_right() -> None:
 def test_a_state_is_stored_once(horizon: int) -> None:
     buffer, count = filled(stream(16, 100, 50, horizon=horizon), 10_000)
     packed = buffer._transform[0]
-    row = packed._rows.shape[-1]
+    row = packed._states.rows.shape[-1]
     # Two percent for the first states of episodes, and the first column of a batch of several.
     assert packed.nbytes / row <= 1.05 * count * (1 if horizon == 1 else 1.2)
     stored = buffer.storage.get(range(len(buffer)))
@@ -109,7 +154,7 @@ def test_a_state_is_stored_once(horizon: int) -> None:
 def test_states_that_nothing_refers_to_are_dropped() -> None:
     buffer, _ = filled(stream(8, 400, 20), 128)
     packed = buffer._transform[0]
-    assert packed.nbytes / packed._rows.shape[-1] <= 1.3 * (128 + 2 * 8)
+    assert packed.nbytes / packed._states.rows.shape[-1] <= 1.3 * (128 + 2 * 8)
 
 
 def test_it_is_saved_and_loaded() -> None:

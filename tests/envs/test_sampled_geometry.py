@@ -88,7 +88,7 @@ def bytes_of_a_transition(env: TransformedEnv, keys: list[NestedKey], limit: int
 
 
 @ALL_ENVS
-@pytest.mark.parametrize("limit", [56, 80, 10**6])
+@pytest.mark.parametrize("limit", [48, 80, 10**6])
 def test_stored_sets_keep_the_limit(make_env: type[TransformedEnv], limit: int) -> None:
     env = make_env()
     more = bytes_of_a_transition(env, read_of(env), limit)

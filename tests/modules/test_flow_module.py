@@ -22,6 +22,7 @@ from cnfp_torchrl.bijectors import (
     NoDensityError,
     Projection,
     RadialSquash,
+    Recession,
     SoftSquash,
     SquashChain,
 )
@@ -38,8 +39,9 @@ from cnfp_torchrl.modules import (
     with_reference_entropy,
 )
 
-FLOWS = ["exact", "gauge", "soft", "radial", "squash", "unconstrained"]
-EXACT_FLOWS = ["exact", "gauge", "soft", "radial"]
+FLOWS = ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
+NAMES = [*FLOWS[:5], "squash", "projection", "unconstrained"]
+EXACT_FLOWS = ["exact", "gauge", "soft", "recession", "radial"]
 SAFE_FLOWS = [*EXACT_FLOWS, "projection"]  # the last without a density
 EXPLORATION_TYPES = [
     ExplorationType.RANDOM,
@@ -126,13 +128,14 @@ def test_each_missing_entry_is_named(
         ("exact", ExactSquash),
         ("gauge", GaugeSquash),
         ("soft", SoftSquash),
+        ("recession", Recession),
         ("radial", RadialSquash),
-        ("projection", Projection),
         ("squash", SquashChain),
+        ("projection", Projection),
         ("unconstrained", BoxSquash),
         (SquashFlow(max_radius=0.5), SquashChain),
     ],
-    ids=["exact", "gauge", "soft", "radial", "projection", "squash", "unconstrained", "object"],
+    ids=[*NAMES, "object"],
 )
 def test_flows_by_name_and_as_objects(
     make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type
@@ -143,8 +146,7 @@ def test_flows_by_name_and_as_objects(
 
 
 def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
-    names = ["exact", "gauge", "soft", "radial", "squash", "projection", "unconstrained"]
-    message = re.escape(f"flow: expected one of {names} or a Flow, given 'gage'")
+    message = re.escape(f"flow: expected one of {NAMES} or a Flow, given 'gage'")
     with pytest.raises(ValueError, match=message):
         make_actor(flow="gage")
 

@@ -99,3 +99,16 @@ def test_what_does_not_fit_is_refused() -> None:
         layer(torch.zeros(64, 2, dtype=torch.float64), sets, torch.zeros(64, 2))
     with pytest.raises(GeometryError, match="anchor: expected a point strictly inside"):
         layer(torch.zeros(64, 2, dtype=torch.float64), Region(sets.sets))
+
+
+def test_barriers_without_bounds_or_anchor() -> None:
+    """The recession keeps half-spaces alone, where a soft retraction needs an anchor."""
+    infinite = torch.full((2,), torch.inf)
+    rows = HalfSpaces(torch.tensor([[1.0, 0.2], [0.1, 1.0]]), torch.tensor([0.5, 0.0]))
+    layer, sets = ConstraintLayer("recession"), (Box(-infinite, infinite), rows)
+    output = torch.cat([10.0**k * torch.randn(500, 2) for k in range(9)])
+    assert rows.contains(layer(output, sets)).all()
+    safe = torch.tensor([-30.0, -40.0])
+    torch.testing.assert_close(layer(torch.zeros(2), sets, safe), safe)
+    with pytest.raises(GeometryError, match="finite bounds"):
+        ConstraintLayer("soft")(output, sets)

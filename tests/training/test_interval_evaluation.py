@@ -26,8 +26,8 @@ def rows(folder: RunFolder, name: str) -> list[tuple[int, float]]:
 def test_training_goes_the_same_way_with_and_without(tiny_run: Run) -> None:
     folder, summary = tiny_run(*EVALUATED)
     without, plain = tiny_run("evaluation.interval=null")
-    # Batches have 16 steps: the first ones that end beyond 50, 100 and 150.
-    assert [each["step"] for each in summary["evaluations_in_training"]] == [64, 112, 160]
+    # Batches have 16 steps: the first ones that end beyond 50, 100 and 150, and the last one.
+    assert [each["step"] for each in summary["evaluations_in_training"]] == [64, 112, 160, 192]
     assert plain["evaluations_in_training"] == []
     assert summary["return_mean"] == plain["return_mean"]
     trained, expected = folder.load_checkpoint()["actor"], without.load_checkpoint()["actor"]
@@ -41,7 +41,7 @@ def test_what_is_logged_is_what_the_summary_says(tiny_run: Run) -> None:
         expected = [(each["step"], pytest.approx(each[key])) for each in history]
         assert rows(folder, f"evaluation/{name}") == expected
     for name in ("obstacle", "battery"):
-        assert [value for _, value in rows(folder, f"evaluation/violations_{name}")] == [0, 0, 0]
+        assert [value for _, value in rows(folder, f"evaluation/violations_{name}")] == [0, 0, 0, 0]
         assert all(each["violations"][name] == 0 for each in history)
     assert all(each["episodes"] == 3 for each in history)
 
@@ -53,7 +53,7 @@ def test_the_best_policy_is_that_of_the_best_evaluation(
 
     reports = iter([(1.0, 0), (3.0, 2), (2.0, 0)])  # the second one breaks rules
 
-    def said(self: Any, frames: int) -> dict[str, Any] | None:
+    def said(self: Any, frames: int, is_last: bool) -> dict[str, Any] | None:
         if frames not in (64, 112, 160):
             return None
         score, violations = next(reports)

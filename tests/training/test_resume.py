@@ -78,6 +78,15 @@ def test_a_killed_run_ends_as_one_that_was_not(
     assert not differences(whole, tmp_path / "killed")
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_run_on_a_gpu_goes_on_there(make_config: MakeConfig, tmp_path: Path) -> None:
+    config = make_config(*TINY, "device=cuda")
+    train(config, RunFolder.create(tmp_path / "whole"))
+    run_until(config, tmp_path / "killed", 160)
+    go_on(tmp_path / "killed", make_config=make_config)
+    assert not differences(tmp_path / "whole", tmp_path / "killed")
+
+
 OTHERS = {
     "a learned price": ["loss=sac_lagrangian", "flow=unconstrained", "~env.score"],
     "a full buffer": ["replay_buffer.storage.max_size=72", "checkpoint.keep=1"],

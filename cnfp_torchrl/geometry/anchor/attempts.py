@@ -180,5 +180,7 @@ def _roomiest(
     )
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
-    anchor = stacked.take_along_dim(best.unsqueeze(-1), 0).squeeze(0)
+    # Not take_along_dim, with which an exported program would be one for a single batch size.
+    index = best.unsqueeze(-1).expand(1, *shape, stacked.shape[-1])
+    anchor = stacked.gather(0, index).squeeze(0)
     return Attempt(anchor, upper, (room.squeeze(0) >= 0) & (slack >= SHARE * upper))

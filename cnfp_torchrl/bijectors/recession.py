@@ -1,0 +1,404 @@
+"""The recession of actions along a way out that all half-spaces have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero, stacked
+from cnfp_torchrl.bijectors.soft_retraction import SHARPNESS, SoftContraction, require_sharpness
+from cnfp_torchrl.geometry import (
+    EROSION_IN_EPS,
+    Box,
+    GeometryError,
+    HalfSpaces,
+    Region,
+    broadcast_shape,
+    require_action_bounds,
+)
+
+LEAST_MARGIN = 1e-2
+"""The least sine of the angle between a way out and each row's boundary."""
+
+_STEPS = 64
+"""The steps of the search for a way out among more than two rows."""
+
+_LARGEST_SOFT = 50.0
+"""Beyond it softplus is the identity, in both dtypes."""
+
+
+class Recession(Bijector):
+    r"""Move actions along a common way out of all half-spaces, as far as they need to.
+
+    Let the rows be :math:`A_k a \le b_k`, and r a unit vector with :math:`A_k r < 0` for all k,
+    such as each barrier of a vehicle that can brake has. With the scale s, in action units,
+
+    .. math:: need = \max_k \frac{A_k f - b_k}{-A_k r}, \quad
+        a = f + r\, s\, \mathrm{softplus}(need/s), \quad \log|\det| = -\mathrm{softplus}(need/s),
+
+    a bijection of R^d onto the interior of the intersection, that needs neither an anchor nor
+    bounds and has slope 1 where actions are safe. Rows are eroded by the rounding error of each
+    sample's own numbers, so that actions of any size satisfy all rows with zero tolerance.
+
+    The slope vanishes like :math:`e^{-need/s}` beyond the rows, so that the inverse is right to
+    rounding for actions whose slack in all rows is some hundred rounding errors, and may be
+    infinite or NaN closer to a row (`contains` is false).
+
+    A region with an anchor may have finite bounds and further sets: the recession comes first, then
+    a soft retraction (`SoftRetraction`) of the half-spaces' intersection onto that with the rest.
+    Where its rows have no way out in common, because their intersection is bounded or almost so,
+    the soft retraction alone does it all. A region without an anchor, of half-spaces alone, is
+    refused there, or without checks its actions are NaN.
+
+    Args:
+        region: regions of batch shape ``(*batch,)``. Without an anchor, all sets but the bounds
+            must be half-spaces, and the bounds infinite.
+        way_out: vectors r of any length, ``(*batch, d)``; None takes the one with the largest
+            margin to all rows, minus the point of least length in the hull of their unit normals.
+        scale: scale s of the softness, in action units; with `of_latents` in units of latents.
+        sharpness: sharpness of the soft retraction.
+        of_latents: whether arguments are in units of the bounds, from -1 to 1, as those of a
+            Gaussian policy are, and not in action units.
+        validate_args: whether to check bounds and ways out, which reads them on the host.
+
+    Raises:
+        ValueError: when scale or sharpness are out of range.
+        GeometryError: when a region without an anchor has other sets, finite bounds, or rows
+            without a common way out.
+    """
+
+    def __init__(
+        self,
+        region: Region,
+        way_out: Tensor | None = None,
+        *,
+        scale: float = 1.0,
+        sharpness: float = SHARPNESS,
+        of_latents: bool = False,
+        validate_args: bool = True,
+    ) -> None:
+        super().__init__()
+        self._scale, self._sharpness = require_scale(scale), require_sharpness(sharpness)
+        self._way_out, self._is_alone = way_out, not region.has_anchor
+        if self._is_alone:
+            self._refuse_other_sets(region)
+        else:
+            region = region.with_finite_bounds()
+        if validate_args:
+            self._refuse_bounds(region.bounds)
+        self._given, self._half_width, self._middle = region, None, None
+        if of_latents:
+            low, high = region.bounds.low, region.bounds.high
+            bounded = low.isfinite() & high.isfinite()
+            self._half_width = torch.where(bounded, (high - low) / 2, 1.0)
+            self._middle = torch.where(bounded, (high + low) / 2, 0.0)
+        if not self._is_alone:
+            self.region = region.eroded()
+        self._rows = self._rows_of(len(region.sets))
+        self._rest = self._rest_of(len(region.sets), self._rows)
+        if validate_args and self._is_alone:
+            self._refuse_no_way_out()
+
+    @property
+    def shape(self) -> torch.Size:
+        return self._given.shape
+
+    def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        wished, log_det = self._in_action_units(latent)
+        action, change = self._forward(wished, self._rows, self._rest)
+        return action, log_det + change
+
+    def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        wished, log_det = self._in_action_units(latent)
+        _, change = self._forward(wished, None, self._rest_of(1, None))
+        return self._forward(wished, self._rows, self._rest)[0], log_det + change
+
+    def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        point, log_det = action, log_det_zero(action)
+        if self._rest is not None:
+            offset, log_det = self._rest.inverse_and_log_det(point)
+            point = self.region.anchor + offset
+        if self._rows is not None:
+            point, softened = self._rows.inverse(point, self._scale)
+            log_det = log_det + softened
+        if self._half_width is None or self._middle is None:
+            return point, log_det
+        return (point - self._middle) / self._half_width, log_det - self._half_width.log().sum(-1)
+
+    def contains(self, action: Tensor) -> Tensor:
+        if self._is_alone:
+            # Its inverse is finite for all that lies strictly inside.
+            return super().contains(action) & self._given.contains(action)
+        return super().contains(action)
+
+    def stages(self, latent: Tensor) -> Stages:
+        wished, log_det = self._in_action_units(latent)
+
+        def stage(count: int) -> tuple[Tensor, Tensor]:
+            rows = self._rows_of(count)
+            action, change = self._forward(wished, rows, self._rest_of(count, rows))
+            return action, log_det + change
+
+        return stacked(stage(count) for count in range(1, len(self._given.sets) + 1))
+
+    def _in_action_units(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        if self._half_width is None or self._middle is None:
+            return latent, log_det_zero(latent)
+        wished = torch.addcmul(self._middle, latent, self._half_width)
+        return wished, self._half_width.log().sum(-1).expand(wished.shape[:-1])
+
+    def _forward(
+        self, wished: Tensor, rows: _Rows | None, rest: SoftContraction | None
+    ) -> tuple[Tensor, Tensor]:
+        point, log_det = wished, log_det_zero(wished)
+        if rows is not None:
+            point, softened = rows.forward(wished, self._scale)
+            log_det = -softened
+        if rest is None:
+            return point, log_det
+        offset = point - self.region.anchor
+        action, change = rest.forward_and_log_det(offset, torch.zeros_like(offset))
+        return action, log_det + change
+
+    def _rows_of(self, count: int) -> _Rows | None:
+        """Return the rows of the half-spaces among the first sets."""
+        sets = self._given.widened()
+        chosen = [
+            (each, self._given.counts(stage))
+            for stage, each in enumerate(sets[:count])
+            if isinstance(each, HalfSpaces)
+        ]
+        if not chosen:
+            return None
+        magnitude = None if self._is_alone else self._given.bounds.magnitude()
+        return _Rows.of(chosen, self._way_out, magnitude, self._is_alone)
+
+    def _rest_of(self, count: int, rows: _Rows | None) -> SoftContraction | None:
+        """Return the retraction from the rows' intersection onto the first sets."""
+        if self._is_alone:
+            return None
+        anchor, sets = self.region.anchor, list(self.region.sets[:count])
+        if rows is None:
+            boxes: list[Box] = [each for each in sets if isinstance(each, Box)]
+            others = [each for each in sets if not isinstance(each, Box)]
+            return SoftContraction(None, boxes, others, anchor, self._sharpness)
+        outer = rows.eroded().gauge_about(anchor)
+        return SoftContraction(outer, [], sets, anchor, self._sharpness)
+
+    def _refuse_other_sets(self, region: Region) -> None:
+        others = [type(s).__name__ for s in region.sets[1:] if not isinstance(s, HalfSpaces)]
+        if others:
+            raise GeometryError(
+                f"sets: expected half-spaces alone in a region without an anchor, given {others}; "
+                "find an anchor with Region.build(sets)"
+            )
+
+    def _refuse_bounds(self, bounds: Box) -> None:
+        if not self._is_alone:
+            require_action_bounds(bounds)
+        elif bool((bounds.low.isfinite() | bounds.high.isfinite()).any()):
+            raise GeometryError(
+                "action bounds: expected infinite ones in a region without an anchor, given low "
+                f"{bounds.low.tolist()}, high {bounds.high.tolist()}; find an anchor with "
+                "Region.build(sets), or state the bounds as half-spaces"
+            )
+
+    def _refuse_no_way_out(self) -> None:
+        if self._rows is None or bool(self._rows.has_way_out.all()):
+            return
+        index = (~self._rows.has_way_out).nonzero()[0].tolist()
+        raise GeometryError(
+            f"half-spaces: expected a direction that leaves no row closer than {LEAST_MARGIN:g} of "
+            f"its length, given rows without one at index {index}; give the region an anchor "
+            "(Region.build(sets)), and it is softly retracted there"
+        )
+
+
+class _Rows(NamedTuple):
+    """The rows of half-spaces, and a common way out of them.
+
+    Args:
+        normals: outward normals, ``(*batch, m, d)``.
+        offsets: offsets, ``(*batch, m)``; infinite for rows that do not count.
+        way_out: unit vectors r, ``(*batch, d)``.
+        rates: how fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
+        has_way_out: where there is a way out, boolean ``(*batch,)``.
+        magnitude: the least size of actions to erode for, ``(*batch,)``; None is 0.
+        is_alone: whether actions are NaN where there is no way out, and not left as they are.
+    """
+
+    normals: Tensor
+    offsets: Tensor
+    way_out: Tensor
+    rates: Tensor
+    has_way_out: Tensor
+    magnitude: Tensor | None
+    is_alone: bool
+
+    @classmethod
+    def of(
+        cls,
+        sets: Sequence[tuple[HalfSpaces, Tensor | None]],
+        way_out: Tensor | None,
+        magnitude: Tensor | None,
+        is_alone: bool,
+    ) -> _Rows:
+        """Return the rows of sets, each with where it is not dropped (None: everywhere)."""
+        normals, offsets = [], []
+        for each, counts in sets:
+            rows = each.superlevel()
+            bound = rows.offsets / rows.rates
+            if counts is not None:
+                bound = torch.where(counts.unsqueeze(-1), bound, torch.inf)
+            normals.append(rows.normals / rows.rates.unsqueeze(-1))
+            offsets.append(bound)
+        shape = broadcast_shape(*(n.shape[:-2] for n in normals), *(o.shape[:-1] for o in offsets))
+        normal = torch.cat([n.expand(*shape, *n.shape[-2:]) for n in normals], -2)
+        offset = torch.cat([o.expand(*shape, o.shape[-1]) for o in offsets], -1)
+        binds = offset < torch.inf
+        found = common_way_out(normal, binds) if way_out is None else way_out
+        length = torch.linalg.vector_norm(found, dim=-1, keepdim=True)
+        found = found / torch.where(length > 0, length, 1)
+        rates = -(normal * found.unsqueeze(-2)).sum(-1)
+        has_way_out = ((rates > LEAST_MARGIN) | ~binds).all(-1)
+        moves = binds & has_way_out.unsqueeze(-1)
+        return cls(
+            normal,
+            torch.where(moves, offset, torch.inf),
+            found,
+            torch.where(moves, rates, 1),
+            has_way_out,
+            magnitude,
+            is_alone,
+        )
+
+    def eroded(self) -> HalfSpaces:
+        """Return the half-spaces of the rows that move actions, eroded for the least size."""
+        assert self.magnitude is not None
+        sets = HalfSpaces(self.normals, self.offsets, validate_args=False)
+        return sets.eroded(self.magnitude)
+
+    def forward(self, wished: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+        """Return the actions, and softplus(need/s), ``(*batch,)``."""
+        with torch.no_grad():
+            moved = softened(self._need(wished, self._erosion(wished)) / scale)
+            erosion = self._erosion(wished, scale * moved)
+        moved = softened(self._need(wished, erosion) / scale)
+        return self._along(wished, scale * moved), moved
+
+    def inverse(self, action: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+        """Return the wished actions, and softplus(need/s), ``(*batch,)``."""
+        with torch.no_grad():
+            # Erosion is that of the wished action, which is not known yet.
+            moved = _softened_of_left(-self._need(action, self._erosion(action)) / scale)
+            wished = self._along(action, -scale * moved)
+            known = wished.isfinite().all(-1)
+            wished = torch.where(known.unsqueeze(-1), wished, action)
+            erosion = self._erosion(wished, torch.where(known, scale * moved, 0))
+        moved = _softened_of_left(-self._need(action, erosion) / scale)
+        return self._along(action, -scale * moved), moved
+
+    def _need(self, point: Tensor, erosion: Tensor) -> Tensor:
+        """Return how far to go along the way out until all rows hold, negative if they do."""
+        beyond = (self.normals * point.unsqueeze(-2)).sum(-1) + erosion - self.offsets
+        # Rows that do not count need nothing: minus the largest number, not minus infinity.
+        lowest = torch.finfo(point.dtype).min / 4
+        return torch.where(self.offsets < torch.inf, beyond / self.rates, lowest).amax(-1)
+
+    def _erosion(self, point: Tensor, moved: Tensor | None = None) -> Tensor:
+        """Return the rounding error of each row at points and on their way out."""
+        size = point.detach().abs()
+        if moved is not None:
+            size = size + moved.detach().abs().unsqueeze(-1) * self.way_out.detach().abs()
+        if self.magnitude is not None:
+            size = torch.maximum(size, self.magnitude.unsqueeze(-1))
+        normals, offsets = self.normals.detach().abs(), self.offsets.detach()
+        offsets = torch.where(offsets < torch.inf, offsets, 0).abs()
+        total = (normals * size.unsqueeze(-2)).sum(-1) + offsets
+        return EROSION_IN_EPS * torch.finfo(point.dtype).eps * total
+
+    def _along(self, point: Tensor, way: Tensor) -> Tensor:
+        moved = torch.addcmul(point, way.unsqueeze(-1), self.way_out)
+        if not self.is_alone:
+            return moved
+        return torch.where(self.has_way_out.unsqueeze(-1), moved, torch.nan)
+
+
+def common_way_out(normals: Tensor, binds: Tensor) -> Tensor:
+    """Return directions that lead away from all rows, with the largest margin, ``(*batch, d)``.
+
+    Minus the point of least length in the convex hull of the normals. The exact one for up to two
+    rows; for more it is found in float64 in a fixed number of steps, and its gradient is that of
+    the rows that decide. Where the hull contains 0 there is none, and the result leads nowhere.
+
+    Args:
+        normals: unit normals, ``(*batch, m, d)``.
+        binds: which rows count, boolean ``(*batch, m)``.
+    """
+    counts = binds.to(normals.dtype)
+    if normals.shape[-2] <= 2:
+        # The point of least length between two unit vectors is their middle.
+        return -(normals * counts.unsqueeze(-1)).sum(-2)
+    rows = normals.double() * binds.unsqueeze(-1)
+    gram = rows @ rows.mT
+    weights = _least_length_weights(gram.detach(), binds)
+    deciding = weights > 1e-6
+    both = deciding.unsqueeze(-1) & deciding.unsqueeze(-2)
+    identity = torch.eye(rows.shape[-2], dtype=rows.dtype, device=rows.device)
+    # A small multiple of the identity, for rows that are equal.
+    system = torch.where(both, gram, 0) + identity * torch.where(deciding, 1e-13, 1.0).unsqueeze(-1)
+    solved = torch.linalg.solve(system, deciding.double())
+    return -(rows * solved.unsqueeze(-1)).sum(-2).to(normals.dtype)
+
+
+@torch.no_grad()
+def _least_length_weights(gram: Tensor, binds: Tensor) -> Tensor:
+    """Return the weights of the point of least length in a hull, by pairwise steps.
+
+    Weight goes from the row that the point is furthest along to the one it is least along, as much
+    as shortens it most (the algorithm of Mitchell, Demyanov and Malozemov, 1974).
+
+    Args:
+        gram: products of all rows, ``(*batch, m, m)``.
+        binds: which rows count, boolean ``(*batch, m)``.
+    """
+    weights = binds.double()
+    weights = weights / weights.sum(-1, keepdim=True).clamp(min=1)
+    for _ in range(_STEPS):
+        along = (gram @ weights.unsqueeze(-1)).squeeze(-1)
+        to = along.masked_fill(~binds, torch.inf).argmin(-1, keepdim=True)
+        since = along.masked_fill(weights <= 0, -torch.inf).argmax(-1, keepdim=True)
+        change = along.gather(-1, since) - along.gather(-1, to)
+        diagonal = gram.diagonal(dim1=-2, dim2=-1)
+        cross = gram.gather(-2, since.unsqueeze(-1).expand(*since.shape[:-1], 1, gram.shape[-1]))
+        cross = cross.squeeze(-2).gather(-1, to)
+        length = diagonal.gather(-1, since) + diagonal.gather(-1, to) - 2 * cross
+        step = torch.where(length > 0, change / length, 0).clamp(min=0)
+        step = torch.minimum(step, weights.gather(-1, since))
+        weights = weights.scatter_add(-1, to, step).scatter_add(-1, since, -step)
+    return weights
+
+
+def softened(need: Tensor) -> Tensor:
+    """Return softplus, computed where it differs from its argument in float64, too."""
+    return softplus(need, threshold=_LARGEST_SOFT)
+
+
+def _softened_of_left(left: Tensor) -> Tensor:
+    """Return softplus(need) of what is left before the rows, softplus(-need); NaN beyond them."""
+    return -(-torch.expm1(-left)).log()
+
+
+def require_scale(scale: float) -> float:
+    """Return a positive finite scale, or refuse it.
+
+    Raises:
+        ValueError: when it is out of range.
+    """
+    if not 0 < scale < float("inf"):
+        raise ValueError(f"scale: expected a number > 0, given {scale}")
+    return float(scale)

@@ -1,0 +1,137 @@
+"""Exported files: whole, told by their manifest, and as safe as the policy itself."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+from cnfp_torchrl.deploy import (
+    FORMATS,
+    DeployedPolicy,
+    export_policy,
+    observed_states,
+    open_exported,
+    self_test,
+)
+from cnfp_torchrl.deploy.self_test import latencies, with_noise
+from tests.deploy.conftest import actor_for, of_family
+
+WITHOUT_TORCH = """
+import json, sys
+import numpy as np, onnxruntime
+manifest = json.load(open("manifest.json"))
+policy = onnxruntime.InferenceSession(manifest["file"])
+(entry,) = manifest["inputs"]
+states = np.load("states.npy").astype(entry["dtype"])
+action, certified = policy.run(["action", "certified"], {entry["name"]: states})
+assert "torch" not in sys.modules
+assert action.shape == (len(states), len(manifest["action_bounds"]["low"]))
+one, _ = policy.run(None, {entry["name"]: states[:1]})
+assert np.allclose(one, action[:1], atol=1e-5)
+np.savez("answers.npz", action=action, certified=certified)
+"""
+
+
+@pytest.fixture(autouse=True)
+def installed() -> None:
+    pytest.importorskip("onnxruntime", reason="of the extra 'export'")
+    pytest.importorskip("onnxscript", reason="of the extra 'export'")
+
+
+# Of the exporters themselves.
+COMPILERS = pytest.mark.filterwarnings("ignore")
+
+
+@COMPILERS
+def test_onnx_file_and_manifest_are_enough_without_torch(
+    env: TransformedEnv, tmp_path: Path
+) -> None:
+    actor = actor_for(env)
+    # Without steps inwards the program is small; with them, and in all families: the slow tests.
+    policy = DeployedPolicy(actor, env, steps=0)
+    file = export_policy(policy, tmp_path)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert file.name == manifest["file"]
+    assert manifest["inputs"] == [
+        {"name": "observation", "dtype": "float32", "shape": ["batch", 5]}
+    ]
+    assert [each["name"] for each in manifest["constraints"]] == ["battery", "obstacle"]
+    assert manifest["action_bounds"] == {"low": [-1, -1], "high": [1, 1]}
+    assert manifest["versions"]["onnxruntime"]
+
+    states = observed_states(policy, env, actor, 2000)
+    np.save(tmp_path / "states.npy", states[0].numpy())
+    subprocess.run([sys.executable, "-I", "-c", WITHOUT_TORCH], cwd=tmp_path, check=True)
+    answers = np.load(tmp_path / "answers.npz")
+
+    def answered(*inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.tensor(answers["action"]), torch.tensor(answers["certified"])
+
+    found = self_test(policy, answered, states)
+    assert found["violations"] == found["fallback_out_of_bounds"] == 0
+    assert found["certified"] > 0.9 * 2000
+    assert found["largest_difference"] < 1e-4
+
+    with pytest.raises(FileExistsError, match=r"policy\.onnx.*nothing is overwritten"):
+        export_policy(policy, tmp_path)
+    with file.open("ab") as changed:
+        changed.write(b" ")
+    with pytest.raises(ValueError, match=r"expected the file that manifest\.json was written for"):
+        open_exported(tmp_path)
+    with pytest.raises(FileNotFoundError, match="expected one that export_policy wrote"):
+        open_exported(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"to: expected one of .* given 'tflite'"):
+        export_policy(policy, tmp_path / "other", "tflite")
+
+
+@pytest.mark.slow
+@COMPILERS
+@pytest.mark.parametrize("to", FORMATS)
+def test_every_format(to: str, env: TransformedEnv, tmp_path: Path) -> None:
+    actor = actor_for(env)
+    policy = DeployedPolicy(actor, env, stochastic=True)
+    export_policy(policy, tmp_path, to)
+    run = open_exported(tmp_path)
+    states = observed_states(policy, env, actor, 100_000)
+    found = self_test(policy, run, states)
+    assert found["violations"] == found["fallback_out_of_bounds"] == 0
+    assert found["certified"] > 95_000
+    one = with_noise(policy, [value[:1] for value in states])
+    assert latencies({"eager": policy, to: run}, one, rounds=5).keys() == {"eager", to}
+
+
+@pytest.mark.slow
+@COMPILERS
+@pytest.mark.parametrize(
+    ("name", "dim"),
+    [
+        ("box", 6),
+        ("half-box", 2),
+        ("ball", 6),
+        ("huge-ball", 2),
+        ("ellipsoid", 2),
+        ("thin-ellipsoid", 6),
+        ("half-space", 2),
+        ("polytope", 6),
+        ("l1-ball", 6),
+        ("l1-ball-with-zeros", 2),
+        ("positive-part", 6),
+        ("task-space-ball", 2),
+        ("ball-of-components", 6),
+        ("visible", 2),
+        ("sight-or-box", 2),
+        ("zero-rows", 2),
+    ],
+)
+def test_every_family_in_onnxruntime(name: str, dim: int, tmp_path: Path) -> None:
+    policy, inputs = of_family(name, dim, 100_000, steps=2)
+    export_policy(policy, tmp_path)
+    found = self_test(policy, open_exported(tmp_path), inputs)
+    assert found["states"] == 100_000
+    assert found["violations"] == found["fallback_out_of_bounds"] == 0
+    assert found["certified"] > 25_000
