@@ -31,6 +31,7 @@ from cnfp_torchrl.training.callbacks import (
     give_episodes,
 )
 from cnfp_torchrl.training.checkpoints import Attributes
+from cnfp_torchrl.training.collectors import make_collector, shutting_down
 from cnfp_torchrl.training.constraint_counts import (
     ConstraintTally,
     constraint_reports,
@@ -42,6 +43,7 @@ from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, Traini
 from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
+from cnfp_torchrl.training.provenance import provenance
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
 from cnfp_torchrl.training.settings import (
@@ -95,7 +97,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     learner: Learner = instantiate(config.algorithm, _partial_=True)(
         config, env, actor, folder.path / STATES if is_saved else None
     )
-    collector = instantiate(config.collector, _partial_=True)(env, learner.policy)
+    collector = make_collector(config, env, learner.policy)
     learner.begin()
 
     # Callback and loggers
@@ -161,7 +163,11 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             )
 
     with closing(callback), closing(evaluations):
-        with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+        with (
+            closing(metrics),
+            shutting_down(collector),
+            StopRequest(STOP_SIGNALS if is_saved else ()) as stop,
+        ):
             for collected in collector:
                 callback.on_batch(collected)
                 metrics.add_steps(collected.reshape(-1))
@@ -183,7 +189,6 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 metrics.add_evaluation(report)
                 best.offer_evaluation(report)
             metrics.finish()
-        collector.shutdown()
         # Before anything else that may fail or be interrupted.
         folder.save_checkpoint(**trained)
 
@@ -196,6 +201,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             "flow": type(flow_head(actor).flow).__name__,
             "order": flow_head(actor).order,
             "seed": config.seed,
+            **provenance(config.device),
         }
         folder.save_summary(summary)
         state.finish()
