@@ -42,7 +42,8 @@ OPTIONS = sorted(
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_every_option_runs(option: str, tmp_path: Path) -> None:
+def test_every_option_runs(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
     group, _, name = option.rpartition("/")
     config = composed("figures=none", f"{group}={name}", *TINY)
     summary = train(config, RunFolder.create(tmp_path / "run"))

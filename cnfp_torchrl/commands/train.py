@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from cnfp_torchrl.commands.extras import needs_extra
@@ -22,7 +24,8 @@ with needs_extra("train"):
     from cnfp_torchrl.commands.refusals import told_in_a_sentence
     from cnfp_torchrl.commands.sweep import report
     from cnfp_torchrl.commands.sweep_folders import STARTED, sweep_arguments
-    from cnfp_torchrl.configuration import config_directory
+    from cnfp_torchrl.configuration import config_directory, foreign_packages
+    from cnfp_torchrl.training.callbacks import RECORDING
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
     from cnfp_torchrl.training.resume import resumed_config
@@ -75,6 +78,19 @@ def _summary_text(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _next_steps(folder: RunFolder, config: DictConfig) -> str:
+    """Return the commands that look at a run, as they would be typed."""
+    path = shlex.quote(str(folder.path))
+    foreign = foreign_packages(config)
+    lists = " " + shlex.quote(f"trusted=[{','.join(foreign)}]") if foreign else ""
+    options = "".join(f" --trusted {name}" for name in foreign)
+    commands = [f"cnfp-evaluate run={path}{lists}", f"cnfp-explain {path}{options}"]
+    recording = Path(RECORDING)
+    if any(folder.path.glob(f"{recording.stem}*{recording.suffix}")):
+        commands.append(f"cnfp-view {path}")
+    return "next: " + "; ".join(commands)
+
+
 def _objective(summary: Mapping[str, Any]) -> float:
     """Return what a sweeper maximizes: the score, or the return of a task without one.
 
@@ -125,6 +141,8 @@ def _main(config: DictConfig) -> float:
         if config.figures:
             instantiate(config.figures)(folder)
         sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
+        if not is_sweep:
+            sys.stdout.write(f"{_next_steps(folder, config)}\n")
         return _objective(summary)
 
 

@@ -18,7 +18,7 @@ from types import MappingProxyType, ModuleType
 from typing import Any, NoReturn
 
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cnfp_torchrl.configuration.directory import config_directory
@@ -125,6 +125,14 @@ def nameable() -> frozenset[str]:
                 if is_public and _top(member.__module__) == _PACKAGE:
                     objects[f"{module}.{name}"] = member
     return frozenset(objects) | set(map(_home, objects.values()))
+
+
+def foreign_packages(config: DictConfig) -> list[str]:
+    """Return what whoever reads a run of a configuration has to trust, such as ``my_package.``."""
+    content = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(content, dict)
+    named = {str(each) for each in targets([content.get(name) for name in BUILT])} - nameable()
+    return sorted({f"{_top(name)}." for name in named})
 
 
 def locate(name: str) -> Any:

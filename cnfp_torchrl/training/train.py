@@ -43,6 +43,7 @@ from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, Traini
 from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
+from cnfp_torchrl.training.provenance import provenance
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState
 from cnfp_torchrl.training.settings import (
@@ -196,6 +197,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             "flow": type(flow_head(actor).flow).__name__,
             "order": flow_head(actor).order,
             "seed": config.seed,
+            **provenance(config.device),
         }
         folder.save_summary(summary)
         state.finish()

@@ -1,0 +1,149 @@
+"""A trained run as a function from observations to allowed actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import SafeProbabilisticTensorDictSequential
+
+from cnfp_torchrl.envs import GeometryTransform, appended_transforms
+from cnfp_torchrl.keys import CONSTRAINTS_KEY
+from cnfp_torchrl.modules import ConstraintPublisher, flow_head, guarded
+from cnfp_torchrl.training.agent import build_environment, load_actor
+from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, RunFolder
+
+Values = TypeVar("Values", Tensor, NDArray[np.floating])
+"""Tensors, or NumPy's arrays."""
+
+
+class TrainedPolicy:
+    """A function from observations to actions that the constraints allow.
+
+    It computes sets, anchor, network and flow, as training did, and asks no environment.
+
+    Args:
+        actor: The trained actor.
+        env: The environment whose transforms publish the constraints; it is never stepped.
+        deterministic: Whether the action is that of the mean, or drawn.
+        refuse_relaxation: Whether to raise where a constraint gives way, whatever the action.
+    """
+
+    def __init__(
+        self,
+        actor: SafeProbabilisticTensorDictSequential,
+        env: EnvBase,
+        *,
+        deterministic: bool = True,
+        refuse_relaxation: bool = False,
+    ) -> None:
+        flow = flow_head(actor).flow
+        self.actor, self.env = actor, env
+        self._policy = guarded(actor, env, refuse_relaxation=refuse_relaxation)
+        self._mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+        published = appended_transforms(env) if flow.reads_constraints else []
+        self._publishers: list[Any] = [
+            each for each in published if isinstance(each, ConstraintPublisher)
+        ]
+        read = [each for each in self._publishers if isinstance(each, GeometryTransform)]
+        keys = [*(key for each in read for key in each.in_keys), *actor.in_keys]
+        self.in_keys: list[NestedKey] = list(dict.fromkeys(filter(_is_observed, keys)))
+        """The keys of what has to be observed: by networks, and by the constraints' geometry."""
+        spec = env.observation_spec
+        self._specs = {key: spec[key] for key in self.in_keys}
+
+    def __call__(self, observation: Values | Mapping[NestedKey, Values]) -> Values:
+        """Return an allowed action ``(*batch, d)`` for each observation.
+
+        Args:
+            observation: What the environment of training publishes, ``(*batch, n)``: an array, or
+                where several entries are read (`in_keys`), a mapping with each of them.
+
+        Raises:
+            ValueError: for a missing entry, or one of another shape than the environment's.
+            GeometryError: for numbers that are not finite.
+            ConstraintViolationError: when the action is outside a set, which a network that
+                returns NaN would cause; then nothing is returned that could be executed.
+        """
+        given = observation if isinstance(observation, Mapping) else {self._only_key(): observation}
+        entries = {key: self._entry(key, given.get(key)) for key in self.in_keys}
+        first = self.in_keys[0]
+        batch = entries[first].shape[: entries[first].ndim - self._event_ndim(first)]
+        state = TensorDict(entries, batch_size=batch)
+        with torch.no_grad(), set_exploration_type(self._mode):
+            for publisher in self._publishers:
+                state = publisher(state)
+            action = self._policy(state).get(self.env.action_key)
+        is_numpy = isinstance(given[first], np.ndarray)
+        return cast(Values, action.numpy() if is_numpy else action)
+
+    def _only_key(self) -> NestedKey:
+        if len(self.in_keys) > 1:
+            raise ValueError(
+                f"observation: expected a mapping with the entries {self.in_keys}, which networks "
+                "and constraints read, given one array"
+            )
+        return self.in_keys[0]
+
+    def _entry(self, key: NestedKey, value: Values | None) -> Tensor:
+        spec = self._specs[key]
+        event = tuple(spec.shape[len(self.env.batch_size) :])
+        if value is None:
+            raise ValueError(
+                f"observation: expected the entries {self.in_keys}, {key!r} is missing"
+            )
+        tensor = torch.as_tensor(value).to(spec.dtype)
+        if tuple(tensor.shape[max(tensor.ndim - len(event), 0) :]) != event:
+            raise ValueError(
+                f"observation, {key!r}: expected shape (*batch, {', '.join(map(str, event))}), as "
+                f"the environment has it, given {tuple(tensor.shape)}"
+            )
+        return tensor
+
+    def _event_ndim(self, key: NestedKey) -> int:
+        return self._specs[key].ndim - len(self.env.batch_size)
+
+
+def _is_observed(key: NestedKey) -> bool:
+    return not (isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY)
+
+
+def load_policy(
+    run: str | Path,
+    *,
+    best: bool = False,
+    deterministic: bool = True,
+    refuse_relaxation: bool = False,
+    trusted: Sequence[str] = (),
+) -> TrainedPolicy:
+    """Return the policy of a run, guarded, on the CPU.
+
+    Args:
+        run: The folder that training printed when it ended.
+        best: Whether to take the best policy of training in place of the last one.
+        deterministic: Whether the action is that of the mean, or drawn.
+        refuse_relaxation: Whether to raise in a state in which a constraint gives way.
+        trusted: The packages, modules or objects that the run's configuration may name beside the
+            shipped ones: ``["my_package."]``.
+
+    Raises:
+        FileNotFoundError: when the folder holds no finished run, or no best policy.
+        ValueError: when its files are broken or do not fit each other.
+        PermissionError: when its configuration names what is not trusted.
+    """
+    folder = RunFolder.open(run, BEST if best else CHECKPOINT)
+    config = folder.load_config(trusted)
+    env = build_environment(config, batch_size=[1])
+    actor = load_actor(folder, config, env)
+    return TrainedPolicy(
+        actor, env, deterministic=deterministic, refuse_relaxation=refuse_relaxation
+    )

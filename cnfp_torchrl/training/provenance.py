@@ -1,0 +1,76 @@
+"""Where a run came from: versions, commit, command and machine, for its summary."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_PACKAGES = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco")
+
+
+def provenance(device: str) -> dict[str, Any]:
+    """Return versions, the commit of the source if there is one, the command and the machine.
+
+    Args:
+        device: The device of training.
+    """
+    machine: dict[str, Any] = {
+        "system": f"{platform.system()} {platform.machine()}",
+        "cores": os.cpu_count(),
+        "device": device,
+    }
+    if device.startswith("cuda"):
+        machine["accelerator"] = torch.cuda.get_device_name(device)
+    return {
+        "versions": {"python": platform.python_version(), **_versions()},
+        "commit": _commit(Path(__file__).parent),
+        "command": shlex.join(sys.argv),
+        "machine": machine,
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _commit(folder: Path) -> str | None:
+    """Return the commit of this package's source, marked where files differ from it."""
+    # An installed package may lie in a repository of somebody else, which says nothing of it.
+    tracked = _git(folder, "ls-files", "--error-unmatch", Path(__file__).name)
+    commit = _git(folder, "rev-parse", "HEAD") if tracked else None
+    if not commit:
+        return None
+    return (
+        f"{commit}, changed"
+        if _git(folder, "status", "--porcelain", "--untracked-files=no")
+        else commit
+    )
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """Return what git says in a folder; None where there is no git, or no repository."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

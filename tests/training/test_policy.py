@@ -1,0 +1,130 @@
+"""A run as a function: observation in, allowed action out."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from cnfp_torchrl import Ball, GeometryTransform, constrain_env, make_constrained_actor
+from cnfp_torchrl.configuration import config_directory, foreign_packages
+from cnfp_torchrl.geometry import GeometryError
+from cnfp_torchrl.modules import ConstraintViolationError
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
+from cnfp_torchrl.training.agent import build_environment
+from cnfp_torchrl.training.networks import gaussian_network
+from cnfp_torchrl.training.policy import TrainedPolicy, load_policy
+from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.train import train
+
+from .conftest import TINY
+
+
+@pytest.fixture(scope="module", params=["exact", "projection", "unconstrained"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        flow = f"flow={request.param}"
+        config = compose("train", overrides=[*TINY, flow, "evaluation.episodes=1"])
+    folder = RunFolder.create(tmp_path_factory.mktemp("run") / "run")
+    train(config, folder)
+    return folder
+
+
+def steps(run: RunFolder) -> TensorDictBase:
+    """Transitions of the deterministic policy in the environment of training."""
+    env = build_environment(run.load_config(), batch_size=[8], with_anchor=True)
+    env.set_seed(0)
+    policy = load_policy(run.path)
+    state, taken = env.reset(), []
+    for _ in range(12):
+        state["action"] = policy(state["observation"])
+        transition, state = env.step_and_maybe_reset(state)
+        taken.append(transition)
+    return torch.stack(taken, 1)
+
+
+def test_it_acts_as_the_actor_does_in_its_environment(run: RunFolder) -> None:
+    policy = load_policy(run.path)
+    rollout = steps(run)
+    safe = policy.actor[-1].flow.is_safe
+    if safe:
+        assert rollout["next", "cost"].sum() == 0
+    observations = rollout["observation"]
+    actions = policy(observations)
+    assert actions.shape == (8, 12, 2)
+    one = policy(observations[3, 5])
+    torch.testing.assert_close(one, actions[3, 5])
+    array = policy(observations[3, 5].numpy().astype(np.float64))
+    assert isinstance(array, np.ndarray)
+    np.testing.assert_array_equal(array, one.numpy())
+    drawn = load_policy(run.path, deterministic=False)
+    assert not torch.equal(drawn(observations), drawn(observations))
+    if safe:  # otherwise no policy was without violations
+        assert load_policy(run.path, best=True)(observations).shape == actions.shape
+
+
+def test_wrong_observations_are_refused_by_name(run: RunFolder) -> None:
+    policy = load_policy(run.path)
+    for wrong in (np.zeros(4), torch.zeros(3, 6), torch.zeros(())):
+        with pytest.raises(ValueError, match=r"'observation': expected shape \(\*batch, 5\)"):
+            policy(wrong)
+    with pytest.raises(ValueError, match="'observation' is missing"):
+        policy({"state": torch.zeros(5)})
+    if policy.actor[-1].flow.is_safe:
+        with pytest.raises((GeometryError, ConstraintViolationError), match="finite"):
+            policy(torch.full((5,), torch.nan))
+
+
+def test_a_missing_best_policy_is_named(run: RunFolder) -> None:
+    best, kept = run.path / "best.pt", run.path / "kept"
+    if best.exists():
+        best.rename(kept)
+    with pytest.raises(FileNotFoundError, match=r"lacks \['best\.pt'\]"):
+        load_policy(run.path, best=True)
+    if kept.exists():
+        kept.rename(best)
+
+
+class AsBefore(GeometryTransform):
+    """Reads an entry that networks do not."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        center = 0.1 * tensordict["cost"]
+        return Ball(center, torch.full_like(center[..., 0], 0.2), validate_args=False)
+
+
+def test_what_only_constraints_read_is_asked_for() -> None:
+    env = constrain_env(PointNavEnv([1]), AsBefore("ball", in_keys=["cost"]))
+    actor = make_constrained_actor(gaussian_network(5, 2, hidden=[4]), env)
+    policy = TrainedPolicy(actor, env)
+    assert policy.in_keys == ["cost", "observation"]
+    cost, observation = torch.ones(2), torch.zeros(5)
+    action = policy({"observation": observation, "cost": cost})
+    assert (action - 0.1 * cost).norm() <= 0.2
+    with pytest.raises(ValueError, match="a mapping with the entries"):
+        policy(observation)
+
+
+def test_the_summary_says_where_the_run_came_from(run: RunFolder) -> None:
+    summary: dict[str, Any] = json.loads((run.path / "summary.json").read_text())
+    assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
+    assert torch.__version__.startswith(summary["versions"]["torch"].partition("+")[0])
+    assert summary["machine"]["device"] == "cpu"
+    assert summary["machine"]["cores"] >= 1
+    assert summary["command"]
+    commit = summary["commit"]
+    assert commit is None or len(commit.partition(",")[0]) == 40
+
+
+MakeConfig = Callable[..., DictConfig]
+
+
+def test_whoever_reads_a_run_is_told_whom_to_trust(make_config: MakeConfig) -> None:
+    assert foreign_packages(make_config()) == []
+    own = make_config("env.base._target_=my_pendulum.make_env")
+    assert foreign_packages(own) == ["my_pendulum."]
