@@ -63,6 +63,9 @@ EXECUTED_ACTION_KEY = "executed_action"
 EPISODE_COST_KEY = "episode_cost"
 """The sum of the costs of an episode so far, float32 ``(*batch, K)``."""
 
+PIXELS_KEY = "pixels"
+"""A picture of the state, uint8 ``(*batch, height, width, 3)``, of environments that render."""
+
 REWARD_KEY = "reward"
 RAW_REWARD_KEY = "raw_reward"
 """The environment's own reward, kept by `cnfp_torchrl.envs.RewardPenalty`."""

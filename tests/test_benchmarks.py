@@ -17,6 +17,16 @@ def test_flows_are_timed_and_tabulated(tmp_path: Path) -> None:
     assert f"{row['exact']['sample']['ratio']:.2f}" in (tmp_path / "flows.md").read_text()
 
 
+def test_distortion_is_measured_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "distortion.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    rows = {row["flow"]: row for row in json.loads((tmp_path / "distortion.json").read_text())}
+    assert rows["soft, p = 2"]["moved"]["max"] < rows["exact (hard)"]["moved"]["max"]
+    assert rows["projection"]["on_boundary"]["share"] > 0.1
+    text = (tmp_path / "distortion.md").read_text()
+    assert all(f"| {name} |" in text for name in rows)
+
+
 def test_the_stream_is_timed_and_tabulated(tmp_path: Path) -> None:
     script = ROOT / "experiments" / "benchmarks" / "stream.py"
     subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
@@ -50,3 +60,30 @@ def test_what_is_measured_on_a_gpu_is_tabulated(tmp_path: Path) -> None:
     assert not [key for key in document["about"] if key.endswith("failed")]
     text = (tmp_path / "gpu.md").read_text()
     assert all(f"## {title}" in text for title in document["results"])
+
+
+def test_anchors_are_timed_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "anchor_times.py"
+    subprocess.run([sys.executable, script, "--quick", "--output", tmp_path], check=True)
+    holds, relaxed = json.loads((tmp_path / "anchors.json").read_text())["rows"]
+    assert holds["relaxed"] == 0
+    assert relaxed["relaxed"] == 0.25
+    text = (tmp_path / "anchors.md").read_text()
+    for row in (holds, relaxed):
+        assert 0 < row["/ flow"]["low"] <= row["/ flow"]["ratio"] <= row["/ flow"]["high"]
+        assert f"| {row['ms']['anchor']:.2f} |" in text
+
+
+def test_each_line_is_measured_alone_and_tabulated(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "lines.py"
+    lines = ["point-nav-step", "own-step", "whole-path", "flow", "anchors"]
+    arguments = ["--line", *lines, "--quick", "--out", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    for line in lines:
+        path = tmp_path / f"lines_{line.replace('-', '_')}.json"
+        document = json.loads(path.read_text())
+        assert {"torch", "torchrl", "tensordict"} <= set(document["about"])
+        for title, rows in document["results"].items():
+            assert f"## {title}" in path.with_suffix(".md").read_text()
+            assert next(iter(rows.values()))["ratio"] == 1
+            assert all(row["low"] <= row["ratio"] <= row["high"] for row in rows.values())

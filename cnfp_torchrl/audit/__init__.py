@@ -1,6 +1,7 @@
 """The audit of constraint geometry against an environment's own indicators: ``cnfp-audit``."""
 
 from cnfp_torchrl.audit.auditing import AuditSettings, audit
+from cnfp_torchrl.audit.distortion import Distortion, measure_distortion
 from cnfp_torchrl.audit.report import (
     TOGETHER,
     AuditReport,
@@ -15,9 +16,11 @@ __all__ = [
     "AuditReport",
     "AuditSettings",
     "ConstraintMetrics",
+    "Distortion",
     "Executed",
     "Quantiles",
     "Share",
     "WorstState",
     "audit",
+    "measure_distortion",
 ]

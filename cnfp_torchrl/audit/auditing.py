@@ -21,6 +21,7 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.audit.distortion import measure_distortion
 from cnfp_torchrl.audit.lookahead import (
     CopyLookahead,
     Lookahead,
@@ -64,6 +65,10 @@ class AuditSettings:
 
     def __post_init__(self) -> None:
         require_fields("audit", self)
+
+
+_WISHES = 20
+"""The number of allowed actions in each state that distortion is measured at."""
 
 
 @torch.no_grad()
@@ -146,6 +151,11 @@ def audit(
             source: draw_samples(lookahead, head, keys, reader.names, settings.actions)
             for source, lookahead in lookaheads.items()
         }
+        distortion = {
+            source: measure_distortion(head.flow, drawn.region, _WISHES)
+            for source, drawn in samples.items()
+            if head.flow.is_safe
+        }
     worst = [
         max((worst_state(drawn, name, source) for source, drawn in samples.items()), key=_first)[1]
         for name in head.order
@@ -159,6 +169,7 @@ def audit(
             "settings": asdict(settings),
         },
         sources={source: measure(drawn, settings.examples) for source, drawn in samples.items()},
+        distortion=distortion,
         executed=executed(rollouts, reader, head, keys, settings.examples),
         order=tuple(head.order),
         notes=tuple(_notes(head.order, reader.names, state_setter)),

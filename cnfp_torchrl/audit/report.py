@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from cnfp_torchrl.audit.distortion import Distortion
 from cnfp_torchrl.audit.statistics import Quantiles, Share
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import CONSTRAINT_STATES
@@ -127,6 +128,8 @@ class AuditReport:
         notes: remarks on what the numbers leave out.
         strict: flag that makes dead ends flaws.
         worst_states: worst states, one for each constraint, for pictures; not part of `as_dict`.
+        distortion: what the flow does to allowed actions, by the states' source; empty for flows
+            that are not safe.
     """
 
     subject: dict[str, Any]
@@ -136,6 +139,7 @@ class AuditReport:
     notes: tuple[str, ...] = ()
     strict: bool = False
     worst_states: tuple[WorstState, ...] = field(default=(), repr=False)
+    distortion: dict[str, Distortion] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return "\n\n".join(_paragraphs(self))
@@ -201,6 +205,7 @@ class AuditReport:
                 for source, measured in self.sources.items()
             },
             "executed": asdict(self.executed),
+            "distortion": {source: asdict(found) for source, found in self.distortion.items()},
         }
 
 
@@ -225,6 +230,13 @@ _COVERAGE: _Columns = {
 }
 """Columns of the three tables, each of which fits a terminal of 100 columns."""
 
+_DISTORTION: dict[str, Callable[[Distortion], str]] = {
+    "moved (95 %)": lambda x: f"{_number(x.moved['median'])} ({_number(x.moved['q95'])})",
+    "smallest (5 %)": lambda x: f"{_number(x.smallest['median'])} ({_number(x.smallest['q05'])})",
+    "largest (95 %)": lambda x: f"{_number(x.largest['median'])} ({_number(x.largest['q95'])})",
+    "samples on the boundary": lambda x: _percent(x.on_boundary),
+}
+
 _LEGEND = """\
 unsound: actions inside the active set that the environment's indicator calls violations
 escaped: samples of the flow outside the set, widened where it is relaxed
@@ -237,7 +249,10 @@ coverage: share of the actions allowed by the indicators, one step ahead, that t
   reach, with a 95 % interval over states; below 100 % is no flaw where a set plans further ahead
 binding: the coverage in states where the set leaves some action out
 volume: share of the action bounds inside the set, median over states
-anchor slack: of the anchor, in action units, median over states"""
+anchor slack: of the anchor, in action units, median over states
+allowed actions: how far the flow moves wished actions that are allowed already, as a share of the
+  way from the anchor to the boundary, and its smallest and largest slope there, medians; 1 leaves
+  them alone. Samples on the boundary: of latents N(0, 1), up to rounding in float32"""
 
 
 def _paragraphs(report: AuditReport) -> Iterator[str]:
@@ -253,6 +268,11 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
                 [source, metrics.name, *(cell(metrics) for cell in columns.values())]
                 for metrics in measured
             ]
+        yield text_table(rows)
+    if report.distortion:
+        rows = [["allowed actions", *_DISTORTION]]
+        for source, found in report.distortion.items():
+            rows.append([source, *(cell(found) for cell in _DISTORTION.values())])
         yield text_table(rows)
     yield _LEGEND
     executed = report.executed

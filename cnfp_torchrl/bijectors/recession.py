@@ -49,7 +49,7 @@ class Recession(Bijector):
     infinite or NaN closer to a row (`contains` is false).
 
     A region with an anchor may have finite bounds and further sets: the recession comes first, then
-    a soft retraction (`SoftRetraction`) of the half-spaces' intersection onto that with the rest.
+    a soft retraction along rays (`SoftRetraction`) of their intersection onto that with the rest.
     Where its rows have no way out in common, because their intersection is bounded or almost so,
     the soft retraction alone does it all. A region without an anchor, of half-spaces alone, is
     refused there, or without checks its actions are NaN.
@@ -59,7 +59,7 @@ class Recession(Bijector):
             must be half-spaces, and the bounds infinite.
         way_out: vectors r of any length, ``(*batch, d)``; None takes the one with the largest
             margin to all rows, minus the point of least length in the hull of their unit normals.
-        scale: scale s of the softness, in action units; with `of_latents` in units of latents.
+        scale: scale s of the softness, in action units; with ``of_latents`` in units of latents.
         sharpness: sharpness of the soft retraction.
         of_latents: whether arguments are in units of the bounds, from -1 to 1, as those of a
             Gaussian policy are, and not in action units.
@@ -181,13 +181,10 @@ class Recession(Bijector):
         """Return the retraction from the rows' intersection onto the first sets."""
         if self._is_alone:
             return None
-        anchor, sets = self.region.anchor, list(self.region.sets[:count])
-        if rows is None:
-            boxes: list[Box] = [each for each in sets if isinstance(each, Box)]
-            others = [each for each in sets if not isinstance(each, Box)]
-            return SoftContraction(None, boxes, others, anchor, self._sharpness)
-        outer = rows.eroded().gauge_about(anchor)
-        return SoftContraction(outer, [], sets, anchor, self._sharpness)
+        anchor = self.region.anchor
+        # All along rays, also without rows: a set that is dropped must be as if it were not there.
+        outer = None if rows is None else rows.eroded().gauge_about(anchor)
+        return SoftContraction(outer, [], self.region.sets[:count], anchor, self._sharpness)
 
     def _refuse_other_sets(self, region: Region) -> None:
         others = [type(s).__name__ for s in region.sets[1:] if not isinstance(s, HalfSpaces)]

@@ -136,6 +136,7 @@ EXPECTED = {
     "visual.every": COUNT,
     "visual.episodes": COUNT,
     "visual.samples": COUNT,
+    "visual.render_every": WHOLE,
     "visual.deterministic": FLAG,
     "visual.projections": _or_null(PAIRS),
     "visual.viewer.port": _or_null(PORT),

@@ -114,7 +114,7 @@ class DeployedPolicy(nn.Module):
         """Return actions ``(B, d)`` and which are certified, boolean ``(B,)``.
 
         Args:
-            inputs: The entries of `input_keys`, ``(B, *event)``, and noise if it is stochastic.
+            inputs: The entries of ``input_keys``, ``(B, *event)``, and noise if it is stochastic.
         """
         states = self.states(*inputs)
         bounds = self.bounds.on(inputs[0].device)

@@ -2,6 +2,7 @@
 
 from cnfp_torchrl.envs.action_guard import ActionGuard
 from cnfp_torchrl.envs.anchor_transform import ConstraintAnchor
+from cnfp_torchrl.envs.camera import Camera, can_render
 from cnfp_torchrl.envs.constrain_env import constrain_env
 from cnfp_torchrl.envs.constrained_actions import ConstrainedActions
 from cnfp_torchrl.envs.cost import (
@@ -23,14 +24,17 @@ from cnfp_torchrl.envs.sampled_geometry import (
 from cnfp_torchrl.envs.task_view import (
     NOTHING,
     Boxes,
+    Component,
     Discs,
     Map,
     Marks,
     Polyline,
     Series,
     Shape,
+    ShowTask,
     StateSetter,
     TaskView,
+    environment_layers,
     find_task_view,
 )
 
@@ -41,6 +45,8 @@ __all__ = [
     "NOTHING",
     "ActionGuard",
     "Boxes",
+    "Camera",
+    "Component",
     "ConstrainedActions",
     "ConstraintAnchor",
     "ConstraintCost",
@@ -57,14 +63,17 @@ __all__ = [
     "SampledGeometry",
     "Series",
     "Shape",
+    "ShowTask",
     "StateSetter",
     "TaskView",
     "amounts_keys",
     "appended_transforms",
+    "can_render",
     "constrain_env",
     "constraint_bijectors",
     "constraint_names",
     "constraints_to_sample",
     "counted_constraints",
+    "environment_layers",
     "find_task_view",
 ]

@@ -122,7 +122,10 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             self._watch.all_held(batch.numel())
         else:
             found = finish_anchor(begun, self._leeway)
-            self._watch([bounds, *sets], found.largest(), batch.numel())
+            if self._watch.looks and bool(found.active.all()):
+                self._watch.all_held(batch.numel())
+            else:
+                self._watch([bounds, *sets], found.largest(), batch.numel())
         next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
         for stage, bijector in enumerate(self._bijectors, start=1):
             rows = found.relaxation[stage].expand(*batch, found.relaxation[stage].shape[-1])

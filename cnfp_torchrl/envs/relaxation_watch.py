@@ -37,6 +37,11 @@ class RelaxationWatch:
         self._looks_left = LOOKS if names else 0
         self._begin_look()
 
+    @property
+    def looks(self) -> bool:
+        """Whether anybody watches still."""
+        return self._looks_left > 0
+
     def _begin_look(self) -> None:
         self._seen, self._have_all_held = 0, False
         self._had: Tensor | None = None

@@ -1,4 +1,4 @@
-"""The view of a task that an environment may offer: sentences, a map, time series, chosen states.
+"""The view of a task that an environment may offer: names, sentences, a map, series, states.
 
 Explanations, figures, the stream and the audit work for any environment. One that can show more
 than its observation does so through a `TaskView`, which a method of its class returns::
@@ -8,18 +8,21 @@ than its observation does so through a `TaskView`, which a method of its class r
             return MyView(self)
 
 ``env`` is the environment as it is used, with all its transforms. A Gymnasium environment may have
-such a method, too. Every part of a `TaskView` has a default that shows nothing.
+such a method, too, and `ShowTask` gives a view to an environment whose class has none. Every part
+of a `TaskView` has a default that shows nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, SerialEnv, Transform, TransformedEnv
+
+from cnfp_torchrl.modules import appended_transforms
 
 Point = tuple[float, float]
 
@@ -133,8 +136,32 @@ class Series:
         return f"{name} ({self.unit})" if self.unit else name
 
 
+@dataclass(frozen=True)
+class Component:
+    """A component of an action or of an observation.
+
+    Args:
+        name: The component's name, such as ``hip torque``.
+        unit: The unit, such as ``N m``.
+    """
+
+    name: str
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
 class TaskView:
     """The view of a task on its states, empty until a subclass overrides parts of it."""
+
+    action_components: Sequence[Component] = ()
+    """The names and units of the action's components, all of them or none."""
+
+    observation_components: Sequence[Component] = ()
+    """The names and units of the components of ``observation``, all of them or none."""
 
     map: Map | None = None
     """The map, for tasks in a plane; then `position` is needed."""
@@ -184,22 +211,53 @@ NOTHING: TaskView = TaskView()
 """The view of a task that shows nothing."""
 
 
+class ShowTask(Transform):
+    """Gives a view to an environment whose class has none; changes nothing else.
+
+    Args:
+        view: The view.
+    """
+
+    def __init__(self, view: TaskView) -> None:
+        super().__init__()
+        self.view = view
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset
+
+
 def find_task_view(env: EnvBase | None) -> TaskView:
     """Return the view of an environment, which may be below transforms; else an empty one.
 
     Environments that run in workers are not asked.
     """
-    layer: object = env
-    while layer is not None:
+    for layer in environment_layers(env):
+        if isinstance(layer, TransformedEnv):
+            views = [t.view for t in appended_transforms(layer) if isinstance(t, ShowTask)]
+            if views:
+                return views[-1]
         # Not hasattr(layer, ...): a batched environment that was never reset would forward that to
         # its workers, which do not exist yet.
-        if hasattr(type(layer), "task_view"):
+        elif hasattr(type(layer), "task_view"):
             return layer.task_view(env)  # type: ignore[attr-defined]
-        layer = layer.base_env if isinstance(layer, TransformedEnv) else _wrapped(layer)
     return NOTHING
 
 
-def _wrapped(layer: object) -> object | None:
-    """Return the environment of another library that one of TorchRL's wraps."""
-    inner = getattr(layer, "__dict__", {}).get("_env")
-    return getattr(inner, "unwrapped", None)
+def environment_layers(env: EnvBase | None) -> Iterator[object]:
+    """Yield an environment and what it wraps, to the innermost one.
+
+    Of environments in a row, `torchrl.envs.SerialEnv`, the first one is taken, once they are made,
+    which is at the first reset; what runs in workers is out of reach.
+    """
+    layer: object = env
+    while layer is not None:
+        yield layer
+        fields = getattr(layer, "__dict__", {})
+        if isinstance(layer, TransformedEnv):
+            layer = layer.base_env
+        elif isinstance(layer, SerialEnv):
+            layer = None if layer.is_closed else next(iter(fields.get("_envs", [])), None)
+        else:
+            layer = getattr(fields.get("_env"), "unwrapped", None)

@@ -68,13 +68,17 @@ class Ball(ConstraintSet):
         return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        return (eps * (self.radius + length(self.center))).unsqueeze(-1)
+        return (EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size()).unsqueeze(-1)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
         eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        size = self.radius + length(self.center)
-        return type(self)(self.center, torch.sub(self.radius, size, alpha=eps), validate_args=False)
+        radius = torch.sub(self.radius, self._size(), alpha=eps)
+        return type(self)(self.center, radius, validate_args=False)
+
+    def _size(self) -> Tensor:
+        """Return the size of the numbers whose rounding errors add up, ``(*batch,)``."""
+        # Not the center's length, which needs a unit that its squares are in range in.
+        return self.radius + vector_norm(self.center, 1, dim=-1)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         return type(self)(center, radius.expand(center.shape[:-1]), validate_args=False)

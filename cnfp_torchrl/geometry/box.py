@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -18,6 +18,15 @@ from cnfp_torchrl.geometry.constraint_set import (
     GeometryError,
 )
 from cnfp_torchrl.geometry.superlevel import Rows
+
+
+class _Kept(NamedTuple):
+    """What is known of a box: its magnitude, and for points of that size erosion and rounding."""
+
+    magnitude: Tensor
+    eroded: Any
+    rounding: Tensor
+
 
 ACTION_RANGE = {torch.float32: (1e-7, 1e18), torch.float64: (1e-30, 1e150)}
 """The least width and the largest number of action bounds, by dtype, as flows square actions."""
@@ -36,6 +45,7 @@ class Box(ConstraintSet):
     high: Tensor
 
     event_dims: ClassVar[Mapping[str, int]] = {"low": 1, "high": 1}
+    _kept: ClassVar[_Kept | None] = None  # an instance's own where it is prepared
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "low", self.low > self.high, "low <= high"
@@ -71,20 +81,37 @@ class Box(ConstraintSet):
 
     def magnitude(self) -> Tensor:
         """Return the largest coordinate of any point, ``(*batch,)``."""
-        return torch.maximum(self.low.abs(), self.high.abs()).amax(-1)
+        if self._kept is not None:
+            return self._kept.magnitude
+        return torch.maximum(self.high, -self.low).amax(-1)
+
+    def prepared(self) -> Self:
+        """Return the box with what flows and anchors ask of action bounds computed once.
+
+        For bounds that stay the same from state to state; they get no gradient.
+        """
+        box = type(self)(self.low.detach(), self.high.detach(), validate_args=False)
+        magnitude = box.magnitude()
+        kept = _Kept(magnitude, box.eroded(magnitude), box.rounding(magnitude))
+        object.__setattr__(box, "_kept", kept)
+        return box
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+        if self._kept is not None and magnitude is self._kept.magnitude:
+            return self._kept.eroded
         eps, size = EROSION_IN_EPS * torch.finfo(self.dtype).eps, self._size(magnitude)
         low, high = torch.add(self.low, size, alpha=eps), torch.sub(self.high, size, alpha=eps)
         return type(self)(low, high, validate_args=False)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
+        if self._kept is not None and magnitude is self._kept.magnitude:
+            return self._kept.rounding
         moved = EROSION_IN_EPS * torch.finfo(self.dtype).eps * self._size(magnitude)
         return torch.cat([moved, moved], -1)
 
     def _size(self, magnitude: Tensor | float) -> Tensor:
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.low.device)
-        return torch.minimum(torch.maximum(self.low.abs(), self.high.abs()), largest.unsqueeze(-1))
+        return torch.minimum(torch.maximum(self.high, -self.low), largest.unsqueeze(-1))
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         half = radius.unsqueeze(-1)

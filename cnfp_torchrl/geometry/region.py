@@ -223,11 +223,11 @@ class Region:
             )
         magnitude = self.bounds.magnitude()
         sets = [constraint_set.eroded(magnitude) for constraint_set in self.widened()]
-        # Twice the largest distance between two points of the bounds.
-        beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
         for stage in range(1, len(sets)):
             counts = self.counts(stage)
             if counts is not None:
+                # Twice the largest distance between two points of the bounds.
+                beyond = magnitude * (4 * self.anchor.shape[-1] ** 0.5)
                 sets[stage] = sets[stage].unless_dropped(counts, self.anchor, beyond)
         return type(self)(tuple(sets), self.anchor, validate_args=False)
 

@@ -38,6 +38,7 @@ from cnfp_torchrl.modules.guard import (
 from cnfp_torchrl.modules.latent import FlowMap, LatentActor, split_at_latent
 from cnfp_torchrl.modules.layer import ConstraintLayer
 from cnfp_torchrl.modules.network_fit import require_fit
+from cnfp_torchrl.modules.parameter_network import ParameterNetwork
 from cnfp_torchrl.modules.publisher import (
     ConstraintPublisher,
     appended_transforms,
@@ -63,6 +64,7 @@ __all__ = [
     "LatentActor",
     "LostDensityWarning",
     "MissingGeometryError",
+    "ParameterNetwork",
     "ProjectionFlow",
     "RadialFlow",
     "RecessionFlow",

@@ -27,7 +27,7 @@ class ActionBounds(nn.Module):
 
     def __init__(self, box: Box) -> None:
         super().__init__()
-        self._box = Box(box.low, box.high, validate_args=False)
+        self._box = box.prepared()
         self._elsewhere: dict[torch.device, Box] = {}
 
     @property
@@ -47,13 +47,13 @@ class ActionBounds(nn.Module):
         # A loss that is moved takes along parameters and buffers, not their modules. Copied once a
         # device: each copy to a GPU waits for it.
         if device not in self._elsewhere:
-            self._elsewhere[device] = self._box.to(device=device)
+            self._elsewhere[device] = self._box.to(device=device).prepared()
         return self._elsewhere[device]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         device = fn(self._box.low.new_empty(0)).device
         if device.type != "meta":
-            self._box, self._elsewhere = self._box.to(device=device), {}
+            self._box, self._elsewhere = self._box.to(device=device).prepared(), {}
         return self
 
     def __getstate__(self) -> dict[str, Any]:

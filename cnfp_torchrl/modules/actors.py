@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictSequential,
 )
 from tensordict.utils import NestedKey
@@ -29,6 +28,7 @@ from cnfp_torchrl.modules.exploration import refuse_exploration
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule, ReferenceEntropyFlowModule
 from cnfp_torchrl.modules.flows import Flow
 from cnfp_torchrl.modules.network_fit import require_fit
+from cnfp_torchrl.modules.parameter_network import ParameterNetwork
 from cnfp_torchrl.modules.publisher import constraint_bijectors
 
 
@@ -76,7 +76,7 @@ def make_constrained_actor(
             f"{missing}: expected an environment, or both bijectors and spec, given neither "
             f"environment nor {missing}; write make_constrained_actor(network, env)"
         )
-    parameters = TensorDictModule(network, in_keys=list(in_keys), out_keys=[LOC_KEY, SCALE_KEY])
+    parameters = ParameterNetwork(network, in_keys=list(in_keys), out_keys=[LOC_KEY, SCALE_KEY])
     head = ConstrainedFlowModule(
         statement.spec,
         statement.bijectors,

@@ -56,8 +56,8 @@ class ConstraintLayer(nn.Module):
             region: The regions of allowed actions; or their sets, the box of action bounds first,
                 whose anchor is then searched for, if the flow needs one.
             nominal: Actions of a controller of one's own, ``(*batch, d)``. It stays as it is where
-                it is allowed and the correction is 0: `soft` takes its gauges about the nominal
-                action, or where that is closer to the boundary than `room` about the last point
+                it is allowed and the correction is 0: ``soft`` takes its gauges about the nominal
+                action, or where that is closer to the boundary than ``room`` about the last point
                 before on the way there.
 
         Raises:

@@ -75,7 +75,7 @@ class WarmUpPolicy(TensorDictModuleBase):
     Args:
         actor: A constrained actor.
         frames: The number of actions, over all batch elements, before the actor takes over.
-        random: The random policy; None takes `SafeRandomPolicy(actor)`. A policy of
+        random: The random policy; None takes ``SafeRandomPolicy(actor)``. A policy of
             `split_at_latent` needs ``SafeRandomLatents(flow_head(ACTOR))``.
     """
 

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import SafeModule, ValueOperator
 
-from cnfp_torchrl.modules import ConstrainedFlowModule, actor_modules
+from cnfp_torchrl.modules import ConstrainedFlowModule, ParameterNetwork, actor_modules
 
-_PLAIN_MODULES = (TensorDictModule, SafeModule, ValueOperator)
+_PLAIN_MODULES = (TensorDictModule, ParameterNetwork, SafeModule, ValueOperator)
 
 _BLOCK = 16
 """The size of the blocks in which torch's generator on a CPU fills tensors with normal numbers."""

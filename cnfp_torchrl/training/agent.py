@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule
 from cnfp_torchrl.envs import (
     GeometryTransform,
     RewardPenalty,
+    ShowTask,
     constrain_env,
     counted_constraints,
 )
@@ -60,6 +61,9 @@ def build_environment(
     if device is not None:
         base = base.to(device)
     env = TransformedEnv(base, RewardSum(), auto_unwrap=True)
+    view = instantiate(config.env.get("view"), _convert_="all")
+    if view is not None:
+        env.append_transform(ShowTask(view))
     penalty = _penalty(config) if with_penalty else None
     if penalty is not None:  # behind the sum, which is of the reward without it
         env.append_transform(penalty)

@@ -54,10 +54,12 @@ class CallbackFactory(Protocol):
     Args:
         episodes: number of episodes that callbacks get.
         deterministic: take them from the deterministic policy and not from the stochastic one.
+        render_every: number of steps between two pictures of the environment; 0: none.
     """
 
     episodes: int
     deterministic: bool
+    render_every: int
 
     def for_training(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
@@ -110,6 +112,7 @@ def show_episodes(
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[1], with_anchor=True)
     actor = load_actor(folder, config, env)
+    env.reset()  # environments in a row are made here, and can then be asked for names
     callback = factory.for_evaluation(recording, actor, env)
     try:
         give_episodes(callback, factory, settings, env, actor)
@@ -128,6 +131,12 @@ def give_episodes(
 ) -> None:
     """Record as many episodes as a callback's maker asks for, and give them to the callback."""
     for number in range(factory.episodes):
-        callback.on_episode(
-            record_episode(env, actor, settings, number, deterministic=factory.deterministic)
+        episode = record_episode(
+            env,
+            actor,
+            settings,
+            number,
+            deterministic=factory.deterministic,
+            render_every=factory.render_every,
         )
+        callback.on_episode(episode)

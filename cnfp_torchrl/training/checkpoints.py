@@ -81,7 +81,7 @@ class Checkpoints:
             CheckpointError: when the file cannot be written; the earlier ones stay as they are.
         """
         state = {name: component.state_dict() for name, component in components.items()}
-        save_data(self._file(frames), state)
+        save_data(self._file(frames), state, self.path.parent)
         for old in self.frames()[: -self._keep]:
             self._file(old).unlink()
 
@@ -128,13 +128,18 @@ def restore(components: Mapping[str, Stateful], state: Mapping[str, Any], origin
             ) from error
 
 
-def save_data(path: Path, content: Any) -> None:
+def save_data(path: Path, content: Any, run: Path) -> None:
     """Write tensors, numbers, text and containers of them, whole or not at all.
+
+    Args:
+        path: the file.
+        content: what is written.
+        run: the run's folder, for the message.
 
     Raises:
         CheckpointError: when it cannot be written; what had the name before is still there.
     """
-    with _writable(path):
+    with _writable(path, run):
         path.parent.mkdir(exist_ok=True)
         with whole_file(path) as file:
             torch.save(content, file)
@@ -162,7 +167,7 @@ def load_data(path: Path) -> Any:
 
 
 @contextmanager
-def _writable(path: Path) -> Iterator[None]:
+def _writable(path: Path, run: Path) -> Iterator[None]:
     """Name the file that cannot be written, and what to do.
 
     PyTorch tells of a full disk by a RuntimeError, which does not say so.
@@ -172,6 +177,6 @@ def _writable(path: Path) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         cause = error.__context__ if isinstance(error.__context__, OSError) else error
         raise CheckpointError(
-            f"{path}: could not be written ({cause}); the checkpoints before it are whole. Make "
-            f"room, or the folder writable, and go on with: cnfp-train resume={path.parents[1]}"
+            f"{path}: could not be written ({cause}); the states before it are whole. Make room, "
+            f"or the folder writable, and go on with: cnfp-train resume={run}"
         ) from error

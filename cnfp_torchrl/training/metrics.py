@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.record.loggers import Logger, TensorboardLogger, WandbLogger
+from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, WandbLogger
 from tqdm import tqdm
 
 from cnfp_torchrl.training.constraint_counts import (
@@ -157,6 +157,9 @@ class Metrics:
             # Their threads and processes would outlive the run.
             if isinstance(logger, TensorboardLogger | WandbLogger):
                 logger.close()
+            elif isinstance(logger, CSVLogger):
+                for file in logger.experiment.files.values():
+                    file.close()
 
     def _log_entry(self) -> None:
         self._logged_at = self.frames
@@ -204,5 +207,11 @@ class Metrics:
         return mean
 
     def _log(self, name: str, value: float) -> None:
-        for logger in self._loggers:
-            logger.log_scalar(name, value, step=self.frames)
+        try:
+            for logger in self._loggers:
+                logger.log_scalar(name, value, step=self.frames)
+        except OSError as error:
+            raise OSError(
+                f"{name}: could not be logged at step {self.frames} ({error}); the states saved "
+                "before are whole. Make room, and go on with: cnfp-train resume=FOLDER"
+            ) from error

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
+from cnfp_torchrl.training.checkpoints import save_data
 from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
@@ -217,10 +218,13 @@ class RunFolder:
     def save_checkpoint(
         self, file_name: str = CHECKPOINT, /, **modules: nn.Module | torch.optim.Optimizer
     ) -> None:
-        """Write the state dicts of modules and optimizers under their names."""
+        """Write the state dicts of modules and optimizers under their names.
+
+        Raises:
+            CheckpointError: when the file cannot be written.
+        """
         state = {name: module.state_dict() for name, module in modules.items()}
-        with whole_file(self.path / file_name) as file:
-            torch.save(state, file)
+        save_data(self.path / file_name, state, self.path)
 
     def load_checkpoint(self) -> dict[str, Any]:
         """Read the state dicts; tensors and plain containers only, so no code can run.

@@ -51,7 +51,7 @@ class StoredTransitions:
                 "device": str(joined.get("action").device),
                 "transitions": joined.cpu().to_dict(),
             }
-            save_data(self._file(self._count), content)
+            save_data(self._file(self._count), content, self._path.parent)
             self._pending.clear()
 
     def forget(self, oldest: int) -> None:

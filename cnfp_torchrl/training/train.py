@@ -31,6 +31,7 @@ from cnfp_torchrl.training.callbacks import (
     give_episodes,
 )
 from cnfp_torchrl.training.checkpoints import Attributes
+from cnfp_torchrl.training.collectors import make_collector, shutting_down
 from cnfp_torchrl.training.constraint_counts import (
     ConstraintTally,
     constraint_reports,
@@ -96,7 +97,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     learner: Learner = instantiate(config.algorithm, _partial_=True)(
         config, env, actor, folder.path / STATES if is_saved else None
     )
-    collector = instantiate(config.collector, _partial_=True)(env, learner.policy)
+    collector = make_collector(config, env, learner.policy)
     learner.begin()
 
     # Callback and loggers
@@ -162,7 +163,11 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             )
 
     with closing(callback), closing(evaluations):
-        with closing(metrics), StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+        with (
+            closing(metrics),
+            shutting_down(collector),
+            StopRequest(STOP_SIGNALS if is_saved else ()) as stop,
+        ):
             for collected in collector:
                 callback.on_batch(collected)
                 metrics.add_steps(collected.reshape(-1))
@@ -170,7 +175,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     metrics.add_losses(losses)
                 metrics.log_if_due()
                 is_last = metrics.frames >= config.collector.total_frames
-                if (report := evaluations.run_if_due(metrics.frames, is_last)) is not None:
+                if (report := evaluations.run_if_due(metrics.frames, is_last=False)) is not None:
                     metrics.add_evaluation(report)
                     best.offer_evaluation(report)
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
@@ -179,8 +184,11 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     state.save(metrics.frames)
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
+            # Behind the last state, so that an extended run is as one that was longer at once.
+            if (report := evaluations.run_if_due(metrics.frames, is_last=True)) is not None:
+                metrics.add_evaluation(report)
+                best.offer_evaluation(report)
             metrics.finish()
-        collector.shutdown()
         # Before anything else that may fail or be interrupted.
         folder.save_checkpoint(**trained)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterable
 
 # The palette of Okabe and Ito, which stays distinguishable with any color vision.
@@ -27,6 +28,12 @@ def constraint_colors(names: Iterable[str]) -> dict[str, str]:
     given = list(dict.fromkeys(names))
     numbered = {name: _CONSTRAINTS[i % len(_CONSTRAINTS)] for i, name in enumerate(sorted(given))}
     return {name: numbered[name] for name in given}
+
+
+def curve_colors(count: int) -> list[tuple[int, int, int]]:
+    """Return as many colors, as far from each other as the color wheel allows, for curves."""
+    wheel = (colorsys.hsv_to_rgb(i / max(count, 1), 0.6, 0.95) for i in range(count))
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in wheel]
 
 
 def rgb(color: str) -> tuple[int, int, int]:

@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from textwrap import fill
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.envs import NOTHING, TaskView
+from cnfp_torchrl.envs import NOTHING, Component, TaskView
 from cnfp_torchrl.text_table import text_table
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 Effect = Literal["permissive", "restrictive", "relaxed", "dropped", "broken"]
 
 Vector = tuple[float, ...]
+
+_ACTION_UNITS = "action units"
+_WIDTH = 100
+"""Of a terminal, in columns."""
 
 _DRAWS = 1024
 _MOST_DIMENSIONS_TO_MEASURE = 3
@@ -68,9 +73,12 @@ class Explanation:
         bounded: the action after the action bounds alone, None where the flow has no such stage.
         constraints: their effects in order of application, the last one with the highest priority.
         share_allowed: of the action bounds, how much all of them allow; None in many dimensions.
+        share_allowed_before: of the policy's samples, how many the constraints that hold would
+            allow without the flow.
         samples: how many samples the shares are of.
         situation: the environment's state in a sentence, or None.
         is_safe: whether the flow keeps every constraint that it does not drop.
+        components: names and units of the action's components.
     """
 
     action: Vector
@@ -78,107 +86,139 @@ class Explanation:
     bounded: Vector | None
     constraints: tuple[ConstraintEffect, ...]
     share_allowed: float | None
+    share_allowed_before: float
     samples: int
     situation: str | None
     is_safe: bool
+    components: tuple[Component, ...]
 
     def markdown(self) -> str:
-        """Return it as Markdown with a table, for a viewer's panel."""
-        head, *rows = self._table()
-        table = [head, ["---"] * len(head), *([_escaped(cell) for cell in row] for row in rows)]
-        lines = ["| " + " | ".join(row) + " |" for row in table]
-        parts = [
-            f"**{self._headline()}**",
-            self.situation,
-            "\n".join(lines),
-            *self._sentences("**"),
-        ]
+        """Return it as Markdown with tables, for a viewer's panel."""
+        tables = [_markdown_table(rows) for rows in (self._effects(), self._stages()) if rows]
+        parts = [f"**{self._headline()}**", self.situation, *tables, *self._sentences()]
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def text(self) -> str:
-        """Return it as plain text with an aligned table, for a terminal."""
-        table = text_table(self._table())
-        parts = [self._headline(), self.situation, table, "\n".join(self._sentences(""))]
+        """Return it as plain text with aligned tables, for a terminal."""
+        tables = [text_table(rows) for rows in (self._stages(), self._effects()) if rows]
+        sentences = "\n".join(fill(sentence, _WIDTH) for sentence in self._sentences())
+        situation = self.situation and fill(self.situation, _WIDTH)
+        parts = [fill(self._headline(), _WIDTH), situation, *tables, sentences]
         return "\n\n".join(part for part in parts if part) + "\n"
 
-    def _headline(self) -> str:
-        moved = [
-            each
-            for each in self.constraints
-            if each.effect in ("restrictive", "relaxed") and each.moved
-        ]
-        said = [f"{each.name} moved the executed action by {each.moved:.3f}" for each in moved]
-        said += [
-            f"{each.name} is relaxed by {each.relaxation:.3g}"
-            for each in self.constraints
-            if each.effect == "relaxed"
-        ]
-        said += [
-            f"{each.name} is {each.effect}"
-            for each in self.constraints
-            if each.effect in ("dropped", "broken")
-        ]
-        if not said and self.is_safe:
-            said = ["no constraint changed the executed action"]
-        elif not said:
-            said = ["the executed action keeps every constraint"]
-        return _capitalized("; ".join(said)) + "."
+    @property
+    def unit(self) -> str:
+        """The unit of distances between actions."""
+        return unit_of(self.components)
 
-    def _table(self) -> list[list[str]]:
-        rows = [["stage", "executed action", "moved", "samples moved", "allows", "effect"]]
-        if self.latent is not None:
-            rows.append(["base", _vector(self.latent), "", "", "", ""])
-        if self.bounded is not None:
-            rows.append(["bounds", _vector(self.bounded), "", "", "100 %", ""])
-        for each in self.constraints:
-            moved = "" if each.moved is None else f"{each.moved:.3f}"
-            after = "" if each.after is None else _vector(each.after)
-            shares = [_percent(each.share_moved), _percent(each.share_allowed)]
-            rows.append([each.name, after, moved, *shares, each.effect])
-        rows.append(["action", _vector(self.action), "", "", _percent(self.share_allowed), ""])
+    def _amount(self, amount: float) -> str:
+        return f"{amount:.3g} {self.unit}"
+
+    def _headline(self) -> str:
+        effects = self.constraints
+        phrases = [
+            f"the {effect.name} constraint moved the action by {self._amount(effect.moved)}"
+            for effect in effects
+            if effect.effect in ("restrictive", "relaxed") and effect.moved
+        ]
+        phrases += [
+            f"the {effect.name} constraint is relaxed by {self._amount(effect.relaxation)}"
+            for effect in effects
+            if effect.effect == "relaxed"
+        ]
+        phrases += [
+            f"the {effect.name} constraint is dropped"
+            for effect in effects
+            if effect.effect == "dropped"
+        ]
+        phrases += [
+            f"the action breaks the {effect.name} constraint by {self._amount(-effect.slack)}"
+            for effect in effects
+            if effect.effect == "broken"
+        ]
+        if not phrases:
+            moved = "no constraint moved the action" if self.is_safe else ""
+            phrases = [moved or "the action keeps every constraint"]
+        sentence = "; ".join(phrases)
+        return f"{sentence[0].upper()}{sentence[1:]}."
+
+    def _stages(self) -> list[list[str]]:
+        """Return the action's way: a row for each component, a column for each stage."""
+        columns = [("base", self.latent), ("bounds", self.bounded)]
+        columns += [(effect.name, effect.after) for effect in self.constraints]
+        known = [(name, values) for name, values in columns if values is not None]
+        known.append(("executed", self.action))
+        rows = [["action", *(name for name, _ in known)]]
+        for i, component in enumerate(self.components):
+            rows.append([component.title, *(f"{values[i]:.3f}" for _, values in known)])
         return rows
 
-    def _sentences(self, mark: str) -> list[str]:
-        return [
-            f"{mark}{each.name}{mark}: {self._verdict(each)} {each.sentence or ''}".rstrip()
-            for each in self.constraints
-        ]
+    def _effects(self) -> list[list[str]]:
+        """Return a row for each constraint, and one for all together."""
+        if not self.constraints:
+            return []
 
-    def _verdict(self, each: ConstraintEffect) -> str:
-        if each.effect in ("dropped", "relaxed"):
+        def allowed(cell: str) -> list[str]:
+            return [] if self.share_allowed is None else [cell]
+
+        rows = [["constraint", "effect", f"moved ({self.unit})", "samples moved"]]
+        rows[0] += [*allowed("allows"), f"slack ({self.unit})"]
+        for effect in self.constraints:
+            moved = "" if effect.moved is None else f"{effect.moved:.3f}"
+            share = allowed(_percent(effect.share_allowed))
+            row = [effect.name, effect.effect, moved, _percent(effect.share_moved), *share]
+            rows.append([*row, f"{effect.slack:.3f}"])
+        if self.share_allowed is not None:
+            rows.append(["together", "", "", "", _percent(self.share_allowed), ""])
+        return rows
+
+    def _sentences(self) -> list[str]:
+        sentences = [f"{self._verdict(x)} {x.sentence or ''}".rstrip() for x in self.constraints]
+        if self.constraints and self.is_safe:
+            share = _percent(self.share_allowed_before)
+            sentences.append(f"Without the flow, {share} of the samples would be allowed.")
+        return sentences
+
+    def _verdict(self, effect: ConstraintEffect) -> str:
+        subject = f"The {effect.name} constraint"
+        if effect.effect in ("dropped", "relaxed"):
             names = [other.name for other in self.constraints if other.effect != "dropped"]
             order = [other.name for other in self.constraints]
-            higher = [name for name in names if order.index(name) > order.index(each.name)]
+            higher = [name for name in names if order.index(name) > order.index(effect.name)]
             others = f" together with {_listed(higher)}" if higher else ""
             reason = f"no action within the bounds keeps it{others}"
-            if each.effect == "dropped":
-                return f"dropped, {reason}."
-            return f"relaxed, {reason}: its set is widened by {each.relaxation:.3g}."
-        if each.effect == "broken":
-            where = f"the executed action lies outside its set by {-each.slack:.3g}"
-            return f"broken, {where}, with {_percent(each.share_outside)} of the samples."
-        allows = "" if each.share_allowed is None else f" It allows {_percent(each.share_allowed)}"
-        allows += " of the action bounds." if allows else ""
-        if each.effect == "permissive":
-            return f"permissive, it changed none of {self.samples} samples.{allows}"
-        if each.share_moved is None:
-            return f"restrictive, the executed action lies {each.slack:.3f} inside.{allows}"
-        if each.before is None or each.after is None:
-            did = "the way of the executed action is unknown"
-        elif each.moved:
-            did = f"it moved the executed action from {_vector(each.before)} by {each.moved:.3f}"
-        else:
-            did = "it left the executed action as it was"
-        samples = f"{_percent(each.share_moved)} of {self.samples} samples"
-        return f"restrictive, {did}, and moved {samples}.{allows}"
+            if effect.effect == "dropped":
+                return f"{subject} is dropped: {reason}."
+            return f"{subject} is relaxed by {self._amount(effect.relaxation)}: {reason}."
+        if effect.effect == "broken":
+            samples = f"{_percent(effect.share_outside)} of the samples do"
+            return (
+                f"The action breaks the {effect.name} constraint by {self._amount(-effect.slack)}; "
+                f"{samples}."
+            )
+        if effect.effect == "permissive":
+            return f"{subject} moved none of {self.samples} samples."
+        if effect.share_moved is None:
+            return (
+                f"{subject} is kept: the action lies {self._amount(effect.slack)} inside its set."
+            )
+        samples = f"{_percent(effect.share_moved)} of {self.samples} samples"
+        if effect.before is None or effect.after is None:
+            return f"{subject} moved {samples}; the way of the action itself is unknown."
+        if effect.moved:
+            return f"{subject} moved the action by {self._amount(effect.moved)}, and {samples}."
+        return f"{subject} left the action where it was, and moved {samples}."
 
 
-def explain(snapshot: FlowSnapshot, view: TaskView = NOTHING) -> Explanation:
+def explain(
+    snapshot: FlowSnapshot, view: TaskView = NOTHING, components: Sequence[Component] = ()
+) -> Explanation:
     """Explain what a flow policy did in one step.
 
     Args:
         snapshot: of the step; the followed sample is the executed one.
         view: says what the task knows about the state, in sentences.
+        components: names and units of the action's components; none numbers them.
     """
     sentences = view.constraint_sentences(snapshot.state)
     stages = {stage.applied[-1]: i for i, stage in enumerate(snapshot.stages)}
@@ -205,9 +245,11 @@ def explain(snapshot: FlowSnapshot, view: TaskView = NOTHING) -> Explanation:
         bounded=_plain(path[stages[0]]) if path is not None and has_bounds else None,
         constraints=effects,
         share_allowed=None if allowed is None else _share(allowed[kept].all(0)),
+        share_allowed_before=snapshot.share_allowed_before,
         samples=len(snapshot.latents),
         situation=view.situation(snapshot.state),
         is_safe=snapshot.is_safe,
+        components=tuple(components) or numbered_components(snapshot.dim),
     )
 
 
@@ -277,8 +319,15 @@ def _plain(vector: Tensor) -> Vector:
     return tuple(vector.tolist())
 
 
-def _vector(values: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
+def unit_of(components: Sequence[Component]) -> str:
+    """Return the unit of distances between actions: that of all components, if they have one."""
+    units = {component.unit for component in components}
+    return units.pop() or _ACTION_UNITS if len(units) == 1 else _ACTION_UNITS
+
+
+def numbered_components(dim: int) -> tuple[Component, ...]:
+    """Return components without names of their own, counted from 1."""
+    return tuple(Component(f"a{i + 1}") for i in range(dim))
 
 
 def _percent(share: float | None) -> str:
@@ -296,9 +345,6 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _capitalized(sentence: str) -> str:
-    return sentence[0].upper() + sentence[1:]
-
-
-def _escaped(cell: str) -> str:
-    return cell.replace("|", "\\|")
+def _markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    head, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))

@@ -99,7 +99,7 @@ class Scene:
     @cached_property
     def explanation(self) -> Explanation:
         """What happened, with the shares that are allowed and how far constraints moved things."""
-        return explain(self.snapshot, self.setting.view)
+        return explain(self.snapshot, self.setting.view, self.setting.components)
 
     @cached_property
     def entropy(self) -> float:

@@ -5,16 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import TaskView, counted_constraints, find_task_view
+from cnfp_torchrl.envs import (
+    Component,
+    TaskView,
+    counted_constraints,
+    environment_layers,
+    find_task_view,
+)
+from cnfp_torchrl.keys import OBSERVATION_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.visual.colors import constraint_colors
+from cnfp_torchrl.visual.explanation import numbered_components, unit_of
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
+
+_MOST_OBSERVED = 64
+"""Observations of more components, such as pictures, have no names and no curves."""
 
 _MARGIN = 1.1
 _MARGIN_OF_CHAINS = 1.6
@@ -46,7 +57,11 @@ class Setting:
         high: upper action bounds.
         projections: pairs of components, one row of views for each; none in one dimension.
         view: what the task shows of itself.
+        components: names and units of the action's components.
+        observation: names and units of the components of ``observation``; none where there are too
+            many to show.
         costs: names of the columns of ``cost``; none where the environment counts nothing.
+        moves: whether it is known how far each constraint moves an action.
         reach: how far views extend, in half widths of the action bounds.
         leaves_bounds: whether there can be actions outside the bounds before the last stage.
     """
@@ -57,7 +72,10 @@ class Setting:
     high: tuple[float, ...]
     projections: tuple[tuple[int, int], ...]
     view: TaskView
+    components: tuple[Component, ...]
+    observation: tuple[Component, ...]
     costs: tuple[str, ...]
+    moves: bool
     reach: float
     leaves_bounds: bool
 
@@ -73,16 +91,24 @@ class Setting:
         Args:
             head: its flow module.
             env: shows its task and says what the costs are called; None: neither.
-            projections: pairs of action components, each a row of views; None shows the first two.
+            projections: pairs of action components, each a row of views; None shows each component
+                once.
 
         Raises:
-            ValueError: when a projection does not name two different components of the action, or
-                when the flow has no density.
+            ValueError: when a projection does not name two different components of the action, when
+                the flow has no density, or when the task names another number of components.
         """
         if not head.flow.has_density:
             raise ValueError(
                 "actor: expected a flow with a density, such as flow=exact, given "
                 f"{type(head.flow).__name__}, whose stages have none to draw"
+            )
+        view, dim = find_task_view(env), head.action_dim
+        named = view.action_components or _actuators(env, dim) or numbered_components(dim)
+        if len(named) != dim:
+            raise ValueError(
+                f"action_components: expected {dim} names, one for each component of the action, "
+                f"given {len(named)} by {type(view).__name__}"
             )
         leaves_bounds = head.flow.reads_constraints and not head.flow.is_safe
         return cls(
@@ -90,9 +116,12 @@ class Setting:
             constraints=tuple(head.order),
             low=tuple(head.bounds.low.tolist()),
             high=tuple(head.bounds.high.tolist()),
-            projections=_projections(head.action_dim, projections),
-            view=find_task_view(env),
+            projections=_projections(dim, projections),
+            view=view,
+            components=tuple(named),
+            observation=_observation(env, view),
             costs=() if env is None else counted_constraints(env),
+            moves=head.flow.is_safe,
             reach=_MARGIN_OF_CHAINS if leaves_bounds else _MARGIN,
             leaves_bounds=leaves_bounds,
         )
@@ -104,6 +133,11 @@ class Setting:
         middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
         farthest = 1.05 * float(((samples - middle) / half).abs().max())
         return replace(self, view=view, reach=max(self.reach, farthest))
+
+    @property
+    def unit(self) -> str:
+        """The unit of distances between actions."""
+        return unit_of(self.components)
 
     @property
     def dim(self) -> int:
@@ -139,8 +173,11 @@ class Setting:
                 title = f"{index + 1} · {'action bounds' if name == 'bounds' else name}"
                 if index > 0 and index + 1 == len(self.stages):
                     title = f"{title}, highest priority"
-                if self.dim > 2:
-                    title = f"{title} ({pair_name(components)})"
+                arrows = [
+                    f"{arrow} {self.components[component].title}"
+                    for arrow, component in zip("→↑", components, strict=False)
+                ]
+                title = f"{title} ({', '.join(arrows)})"
                 row.append(StageView(index, tuple(components), title))
             rows.append(row)
         return rows
@@ -163,6 +200,31 @@ def pair_name(components: Sequence[int]) -> str:
     return ", ".join(f"a{component + 1}" for component in components)
 
 
+def _actuators(env: EnvBase | None, dim: int) -> tuple[Component, ...]:
+    """Return the names of MuJoCo's actuators, where an environment has them."""
+    for layer in environment_layers(env):
+        model: Any = getattr(layer, "__dict__", {}).get("model")
+        if getattr(model, "nu", None) == dim:
+            names = [model.actuator(i).name or f"a{i + 1}" for i in range(dim)]
+            return tuple(Component(name) for name in names)
+    return ()
+
+
+def _observation(env: EnvBase | None, view: TaskView) -> tuple[Component, ...]:
+    spec = None if env is None else env.observation_spec.get(OBSERVATION_KEY, None)
+    if env is None or spec is None or len(spec.shape) != len(env.batch_size) + 1:
+        return ()
+    size, named = spec.shape[-1], tuple(view.observation_components)
+    if named and len(named) != size:
+        raise ValueError(
+            f"observation_components: expected {size} names, one for each component of the "
+            f"observation, given {len(named)} by {type(view).__name__}"
+        )
+    if size > _MOST_OBSERVED:
+        return ()
+    return named or tuple(Component(f"o{i + 1}") for i in range(size))
+
+
 def _projections(
     dim: int, projections: Sequence[Sequence[int]] | None
 ) -> tuple[tuple[int, int], ...]:
@@ -172,7 +234,10 @@ def _projections(
                 f"projections: expected none for an action of one component, given {projections}"
             )
         return ()
-    chosen = [(0, 1)] if projections is None else [tuple(each) for each in projections]
+    if projections is None:
+        # Of an odd number of components the last one is shown beside the one before.
+        projections = [(min(i, dim - 2), min(i, dim - 2) + 1) for i in range(0, dim, 2)]
+    chosen = [tuple(pair) for pair in projections]
     for pair in chosen:
         if len(pair) != 2 or len(set(pair)) != 2 or not all(0 <= c < dim for c in pair):
             raise ValueError(

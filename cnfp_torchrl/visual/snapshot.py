@@ -13,10 +13,13 @@ from torch.distributions import Independent, Normal
 from torch.linalg import vector_norm
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.bijectors import Bijector, Stages, has_latent
+from cnfp_torchrl.bijectors import Bijector, BoxSquash, Stages, has_latent
 from cnfp_torchrl.geometry import Region
 from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule, Flow, flow_head
+
+_SATURATED = 0.01
+"""Of the action bounds: samples that spread less in each component lie in a point of a picture."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,17 @@ class FlowSnapshot:
         samples = self.stages[-1].samples
         return torch.stack([each.contains(samples) for each in self.region.sets])
 
+    @cached_property
+    def share_allowed_before(self) -> float:
+        """The share of the samples, squashed into the bounds, that every applied set contains."""
+        squash = BoxSquash.onto(self.region.bounds)
+        bounded, _ = squash.forward_and_log_det(self.latents)
+        allowed = torch.ones(len(bounded), dtype=torch.bool)
+        for k, constraint in enumerate(self.region.sets[1:], start=1):
+            if self.is_active(k):
+                allowed &= constraint.contains(bounded)
+        return float(allowed.double().mean())
+
     def outside(self, stage: int) -> Tensor:
         """Tell, with zero tolerance, which samples lie outside the active sets so far, ``(n,)``.
 
@@ -132,6 +146,23 @@ class FlowSnapshot:
     def path(self) -> Tensor:
         """Return the followed sample after each stage, ``(stages, d)``."""
         return torch.stack([stage.samples[self.followed] for stage in self.stages])
+
+    @property
+    def is_saturated(self) -> bool:
+        """Whether the samples hardly differ once squashed into the bounds, and show little."""
+        bounds = self.region.bounds
+        squashed, _ = BoxSquash.onto(bounds).forward_and_log_det(self.latents)
+        spread = squashed.std(0) / (bounds.high - bounds.low)
+        return bool((spread < _SATURATED).all())
+
+    def with_standard_base(self, seed: int = 0) -> FlowSnapshot:
+        """Return what the flow does in the same state to samples of the standard Gaussian."""
+        zeros = torch.zeros_like(self.loc)
+        loc, scale = self.head.parameter_keys
+        state = self.state.clone().set(loc, zeros).set(scale, torch.ones_like(zeros))
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(self.latents.shape, generator=generator)
+        return snapshot_of(self.head, state, noise)
 
     def following_the_longest_path(self) -> FlowSnapshot:
         """Return the same snapshot, following the sample that the stages move farthest."""

@@ -18,20 +18,29 @@ In a round all that is compared takes its turn; ratios are taken within a round.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import platform
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from statistics import median, quantiles
 from typing import Any
 
 import torch
+from interleaved import (
+    ROUNDS,
+    Call,
+    Replay,
+    Rows,
+    compared,
+    point_nav_start,
+    processor,
+    rounds,
+    versions,
+    wait,
+    write,
+)
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -59,9 +68,7 @@ from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, Poin
 from cnfp_torchrl.training.update import Update
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-ROUNDS = 7
 STARTED = time.perf_counter()
-Call = Callable[[], object]
 
 
 class Sizes:
@@ -78,51 +85,9 @@ class Sizes:
         self.collected = 4 if quick else 32
         self.settled = 4 if quick else 80  # steps until nobody watches relaxation any more
 
-
-def wait(device: torch.device) -> None:
-    """Wait until the device has done all that it was asked to."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-def rounds(calls: dict[str, Call], sizes: Sizes, device: torch.device) -> dict[str, list[float]]:
-    """Return the seconds of a call of each kind in each round."""
-    counts = {}
-    for name, call in calls.items():
-        for _ in range(3):
-            call()
-        wait(device)
-        started = time.perf_counter()
-        call()
-        wait(device)
-        once = time.perf_counter() - started
-        counts[name] = max(1, min(1000, round(sizes.seconds / once)))
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(sizes.rounds):
-        for name, call in calls.items():
-            wait(device)
-            started = time.perf_counter()
-            for _ in range(counts[name]):
-                call()
-            wait(device)
-            times[name].append((time.perf_counter() - started) / counts[name])
-    return times
-
-
-def compared(times: dict[str, list[float]], reference: str, work: int = 1) -> dict[str, Any]:
-    """Return milliseconds, steps a second, and ratios of time to a reference with quartiles."""
-    rows = {}
-    for name, values in times.items():
-        ratios = [a / b for a, b in zip(values, times[reference], strict=True)]
-        low, middle, high = quantiles(ratios, n=4, method="inclusive")
-        rows[name] = {
-            "ms": median(values) * 1e3,
-            "per second": work / median(values),
-            "ratio": middle,
-            "low": low,
-            "high": high,
-        }
-    return rows
+    def timed(self, calls: Mapping[str, Call], device: torch.device) -> dict[str, list[float]]:
+        """Return the seconds of a call of each kind in each round."""
+        return rounds(calls, self.rounds, self.seconds, device)
 
 
 def network(width: int, device: torch.device) -> nn.Module:
@@ -152,43 +117,13 @@ def tanh_actor(env: EnvBase, width: int, device: torch.device) -> ProbabilisticA
     )
 
 
-class Replay:
-    """Steps of one environment by the actions that a constrained actor took in another.
-
-    Both begin in the same states, again and again, so that both go through the same ones.
-
-    Args:
-        env: environment to step, plain or constrained.
-        recorded: rollout of the constrained actor, ``(*batch, steps)``.
-    """
-
-    def __init__(self, env: EnvBase, recorded: TensorDictBase) -> None:
-        self.env, self.time = env, 0
-        self.actions = recorded["action"].unbind(-2)
-        x, y, battery, *goal = recorded["observation"].select(-2, 0).unbind(-1)
-        self.start = {
-            "position": torch.stack([x, y], -1),
-            "battery": (100 * battery).round().long(),
-            "goal": torch.stack(goal, -1),
-        }
-        self.state = env.reset(**self.start)
-
-    def __call__(self) -> None:
-        """Take one step."""
-        action = self.actions[self.time]
-        self.state = self.env.step_mdp(self.env.step(self.state.set("action", action)))
-        self.time = (self.time + 1) % len(self.actions)
-        if self.time == 0:
-            self.state = self.env.reset(**self.start)
-
-
 def replays(agents: int, device: torch.device) -> dict[str, Replay]:
     """Return the steps of the plain and of the constrained environment."""
     env = constrained(agents, device)
     actor = make_constrained_actor(network(64, device), env)
     recorded = env.rollout(40, actor, break_when_any_done=False)
-    plain = PointNavEnv([agents], device=device)
-    return {"plain": Replay(plain, recorded), "constrained": Replay(env, recorded)}
+    plain, start = PointNavEnv([agents], device=device), point_nav_start(recorded)
+    return {"plain": Replay(plain, recorded, start), "constrained": Replay(env, recorded, start)}
 
 
 def collecting(env: EnvBase, policy: nn.Module, steps: int) -> Call:
@@ -206,7 +141,7 @@ def collecting(env: EnvBase, policy: nn.Module, steps: int) -> Call:
 
 
 @torch.no_grad()
-def time_environment(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def time_environment(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return steps a second, plain and constrained, alone and in a collector."""
     results = {}
     for agents in sizes.agents:
@@ -214,16 +149,14 @@ def time_environment(sizes: Sizes, device: torch.device) -> dict[str, Any]:
         for call in steps.values():
             for _ in range(sizes.settled):
                 call()
-        results[f"step of {agents} agents"] = compared(
-            rounds(steps, sizes, device), "plain", agents
-        )
+        results[f"step of {agents} agents"] = compared(sizes.timed(steps, device), "plain", agents)
         plain, env = PointNavEnv([agents], device=device), constrained(agents, device)
         actor = make_constrained_actor(network(64, device), env)
         calls = {
             "unconstrained": collecting(plain, tanh_actor(plain, 64, device), sizes.collected),
             "constrained": collecting(env, actor, sizes.collected),
         }
-        times = rounds(calls, sizes, device)
+        times = sizes.timed(calls, device)
         title = f"collector, {agents} agents, actor of width 64"
         results[title] = compared(times, "unconstrained", agents * sizes.collected)
     return results
@@ -273,18 +206,18 @@ def updating(
     return calls
 
 
-def time_updates(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def time_updates(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return the time of an update for each batch size and width."""
     return {
         f"update, batch {batch}, width {width}": compared(
-            rounds(updating(batch, width, device), sizes, device), KINDS[0]
+            sizes.timed(updating(batch, width, device), device), KINDS[0]
         )
         for batch in sizes.batches
         for width in sizes.widths
     }
 
 
-def time_compiled(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def time_compiled(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return the time of a compiled update of the smallest size, and of its warm-up."""
     batch, width = sizes.batches[0], sizes.widths[-1]
     calls, warm_up = updating(batch, width, device, compiled=True), {}
@@ -296,7 +229,7 @@ def time_compiled(sizes: Sizes, device: torch.device) -> dict[str, Any]:
         wait(device)
         warm_up[kind] = time.perf_counter() - started
     both = {KINDS[0]: eager[KINDS[0]]} | {f"{kind}, compiled": calls[kind] for kind in KINDS}
-    rows = compared(rounds(both, sizes, device), KINDS[0])
+    rows = compared(sizes.timed(both, device), KINDS[0])
     for kind, seconds in warm_up.items():
         rows[f"{kind}, compiled"]["warm-up, s"] = seconds
     return {f"update compiled, batch {batch}, width {width}": rows}
@@ -312,7 +245,7 @@ def layer_problem(batch: int, dim: int, count: int, device: torch.device) -> lis
     return [*sets, Box(-sides[0], sides[1])][: 1 + count]
 
 
-def time_layer(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def time_layer(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return the time of drawing and scoring, constructed at each call, with the backward pass."""
     results = {}
     for batch in sizes.layers:
@@ -352,10 +285,10 @@ def time_layer(sizes: Sizes, device: torch.device) -> dict[str, Any]:
                 return lambda: sum(part.sum() for part in call()).backward()  # type: ignore[union-attr]
 
             title = f"layer, batch {batch}, d = {dim}"
-            results[title] = compared(rounds(dict(calls), sizes, device), "TanhNormal")
+            results[title] = compared(sizes.timed(calls, device), "TanhNormal")
             with_backward = {name: backward(call) for name, call in calls.items()}
             results[f"{title}, with the backward pass"] = compared(
-                rounds(with_backward, sizes, device), "TanhNormal"
+                sizes.timed(with_backward, device), "TanhNormal"
             )
     return results
 
@@ -378,7 +311,7 @@ def hostile_sets(batch: int, dim: int, device: torch.device) -> list[ConstraintS
 
 
 @torch.no_grad()
-def count_violations(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def count_violations(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return how many float32 actions lie outside of a set, and how many the judge objects to."""
     rows, batch = {}, min(sizes.actions // 4, 1_000_000)
     states = min(batch, 20_000)
@@ -433,7 +366,7 @@ def waits(call: Call) -> int:
     return sum("synchroniz" in str(each.message) for each in caught)
 
 
-def count_waits(sizes: Sizes, device: torch.device) -> dict[str, Any]:
+def count_waits(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
     """Return how often the host waits in a step and in an update."""
     if device.type != "cuda":
         return {}
@@ -445,7 +378,7 @@ def count_waits(sizes: Sizes, device: torch.device) -> dict[str, Any]:
     calls: dict[str, Call] = {f"{name} step": step for name, step in steps.items()}
     calls |= {"constrained actor": lambda: actor(state)}
     calls |= {f"update, {kind}": call for kind, call in updating(256, 64, device).items()}
-    rows = {}
+    rows: Rows = {}
     for name, call in calls.items():
         with torch.set_grad_enabled(name.startswith("update")):
             for _ in range(sizes.settled + 3):  # not the last step before a reset
@@ -454,55 +387,16 @@ def count_waits(sizes: Sizes, device: torch.device) -> dict[str, Any]:
     return {"waits for the GPU": rows}
 
 
-def table(title: str, rows: dict[str, dict[str, float]]) -> list[str]:
-    """Return rows as a Markdown table."""
-    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    lines = [f"## {title}", "", f"| | {' | '.join(columns)} |", "|" + "---|" * (len(columns) + 1)]
-    for name, row in rows.items():
-        cells = [_number(row[column]) if column in row else "" for column in columns]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return [*lines, ""]
-
-
-def _number(value: float) -> str:
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:,.0f}" if value >= 100 else f"{value:.2f}" if value >= 1 else f"{value:.3f}"
-
-
-def write(folder: Path, about: dict[str, Any], results: dict[str, Any]) -> None:
-    """Write what is known so far to ``gpu.json`` and ``gpu.md``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {"about": about, "results": results}
-    (folder / "gpu.json").write_text(json.dumps(document, indent=1) + "\n")
-    lines = ["# On a GPU", "", *(f"- {key}: {value}" for key, value in about.items()), ""]
-    lines += [
-        "Medians over rounds in which all take turns; ratios of time to the first row, within a "
-        "round, with quartiles.",
-        "",
-    ]
-    for title, rows in results.items():
-        lines += table(title, rows)
-    (folder / "gpu.md").write_text("\n".join(lines))
-
-
 def about(device: torch.device, sizes: Sizes) -> dict[str, Any]:
     """Return what the numbers depend on."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.machine()
-    known = {}
-    for package in ("cnfp_torchrl", "torch", "torchrl", "tensordict"):
-        try:
-            known[package] = version(package)
-        except PackageNotFoundError:
-            known[package] = getattr(sys.modules.get(package), "__version__", "unknown")
     return {
         "command": f"python experiments/benchmarks/gpu.py {' '.join(sys.argv[1:])}".rstrip(),
         "device": name,
-        "processor cores": os.cpu_count(),
-        "python": platform.python_version(),
+        "processor": processor(),
         "CUDA": torch.version.cuda,
         "rounds": sizes.rounds,
-        **known,
+        **versions(),
     }
 
 
@@ -522,7 +416,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # TF32, which may not break a constraint either
     facts = about(device, sizes)
-    results: dict[str, dict[str, Any]] = {}
+    results: dict[str, Rows] = {}
     parts = [count_violations, count_waits, time_environment, time_updates, time_layer]
     if not (arguments.no_compile or arguments.quick):
         parts.append(time_compiled)
@@ -537,7 +431,7 @@ def main() -> None:
             facts[f"{part.__name__} failed"] = f"{type(error).__name__}: {error}"[:500]
         facts["seconds"] = round(time.perf_counter() - STARTED, 1)
         print(part.__name__, facts["seconds"], "s", flush=True)
-        write(arguments.out, facts, results)
+        write(arguments.out / "gpu.json", "On a GPU", facts, results)
     print((arguments.out / "gpu.md").read_text())
     failed = [key for key in facts if key.endswith("failed")]
     broken = [row for rows in results.values() for row in rows.values() if row.get("violations")]

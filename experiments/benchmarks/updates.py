@@ -10,7 +10,8 @@ width 64 and 256:
   exact flow and the unconstrained actor in `cnfp_torchrl.training`, and Stable-Baselines3's SAC
   with 16 environments of the same task in its vectorized environment.
 
-In a round all take their turn, so that another program's load falls on all of them. Reported are
+In a round all take their turn, so that another program's load falls on all of them; of updates the
+process's own time on the processor counts, which waiting for one does not prolong. Reported are
 medians over rounds of the ratio to Stable-Baselines3 within a round, with the rounds' quartiles.
 """
 
@@ -162,10 +163,10 @@ def time_updates(width: int, rounds: int, repeats: int, *, compiled: bool) -> Ro
     times: Rounds = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            started = time.perf_counter()
+            started = time.process_time()
             for _ in range(repeats):
                 call()
-            times[name].append((time.perf_counter() - started) / repeats * 1e3)
+            times[name].append((time.process_time() - started) / repeats * 1e3)
     return times
 
 

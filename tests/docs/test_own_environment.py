@@ -19,7 +19,6 @@ SHORTER = {
         "training.warmup_frames=32",
         "training.update_ratio=0.1",
         "evaluation.episodes=4",
-        "+figures.states=4",
     ],
     "cnfp-evaluate": ["evaluation.episodes=2"],
     "cnfp-explain": [],

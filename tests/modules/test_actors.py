@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictSequential,
+    set_skip_existing,
 )
 from torch import Tensor, nn
 from torchrl.data import Bounded
@@ -36,6 +37,7 @@ from cnfp_torchrl.modules import (
     ConstrainedFlowModule,
     ConstraintBijector,
     GaugeFlow,
+    ParameterNetwork,
     constrain,
     flow_head,
     guarded,
@@ -458,3 +460,26 @@ def test_the_head_is_the_flow_module(make_actor: MakeActor) -> None:
     actor = make_actor()
     assert flow_head(actor) is actor.module[-1]
     assert isinstance(flow_head(actor), ConstrainedFlowModule)
+
+
+def test_a_network_is_called_as_tensordicts_module_calls_it() -> None:
+    network = torch.nn.Linear(3, 2)
+    both = lambda x: (network(x), network(x).exp())  # noqa: E731 - a network without a module
+    ours = ParameterNetwork(both, in_keys=["x"], out_keys=["loc", "scale"])
+    theirs = TensorDictModule(both, in_keys=["x"], out_keys=["loc", "scale"])
+    x = torch.randn(4, 3)
+    expected, given = (each(TensorDict({"x": x}, batch_size=4)) for each in (theirs, ours))
+    assert set(given.keys()) == set(expected.keys())
+    for key in expected.keys():  # noqa: SIM118 - a tensordict iterates over its batch
+        assert torch.equal(given[key], expected[key])
+    for one, other in zip(ours(x), theirs(x), strict=True):  # by dispatch
+        assert torch.equal(one, other)
+    with set_skip_existing(True):
+        kept = ours(TensorDict({"x": x, "loc": x, "scale": x}, batch_size=4))
+    assert torch.equal(kept["loc"], x)
+    with pytest.raises(KeyError, match="x"):
+        ours(TensorDict({}, batch_size=4))
+    with pytest.raises(RuntimeError):
+        ParameterNetwork(network, in_keys=["x"], out_keys=["loc", "scale"])(
+            TensorDict({"x": x}, batch_size=4)
+        )

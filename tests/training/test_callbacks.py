@@ -37,13 +37,13 @@ Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
 Config = Callable[..., DictConfig]
 
 
-def steps_of(path: Path, entity: str) -> list[int]:
-    """Return the steps at which an entity was logged."""
+def steps_of(path: Path, entity: str, timeline: str = "env_step") -> list[int]:
+    """Return the steps of a timeline at which an entity was logged."""
     found: list[int] = []
     for chunk in RrdReader(str(path)).stream().filter(content=entity):
         batch = chunk.to_record_batch()
-        if "env_step" in batch.schema.names:
-            found += batch.column("env_step").to_pylist()
+        if timeline in batch.schema.names:
+            found += batch.column(timeline).to_pylist()
     return sorted(found)
 
 
@@ -83,8 +83,9 @@ def test_off_imports_nothing(tmp_path: Path) -> None:
 def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run: Run) -> None:
     folder, _ = tiny_run(*FILE, "collector.total_frames=400", "training.log_interval=160")
     path = folder.path / "recording.rrd"
-    # 16 agents are stepped together: 25 steps of each. Then an evaluation episode of 12 steps.
-    assert steps_of(path, "/explanation") == [0, 160, 320, *range(400, 412)]
+    # 16 agents are stepped together: 25 steps of each. Then an episode of 12 steps.
+    assert steps_of(path, "/explanation") == [0, 160, 320]
+    assert steps_of(path, "/explanation", "episode_0") == list(range(12))
     for name in ("violations/obstacle", "loss/qvalue", "loss/actor", "train/alpha"):
         assert steps_of(path, f"/metrics/{name}") == [160, 320, 400], name
 
@@ -98,30 +99,23 @@ def test_episodes_of_the_trained_policy_follow_the_training(
     folder, _ = tiny_run(*FILE, *chosen)
     path = folder.path / "recording.rrd"
     episodes = [episode_of(folder, number, deterministic) for number in (0, 1)]
-    steps = [step for episode in episodes for step in episode]
-    behind = range(192, 192 + 24)
-    assert len(steps) == len(behind)
     last = {"exact": "3\\ obstacle", "squash": "2\\ obstacle", "unconstrained": "1\\ bounds"}[flow]
-    executed = read(path, f"/stages/{last}/executed", "Points2D:positions")
-    assert [step for step in executed if step >= 0] == [0, 160, *behind]
-    for number, step in zip(behind, steps, strict=True):
-        np.testing.assert_array_equal(executed[number][-1], step["action"].numpy())
-    # An episode's return begins anew, and so does the first one's, whatever the training left.
-    reward = torch.stack([step["next", "reward"].squeeze() for step in steps]).double()
-    returns = read(path, "/series/return", "Scalars:scalars")
-    expected = reward.reshape(2, 12).cumsum(1).reshape(-1)
-    np.testing.assert_allclose([returns[number].item() for number in behind], expected.numpy())
-    trail = read(path, "/map/trail", "LineStrips2D:strips")
-    assert [len(trail[number][-1]) for number in (192, 193, 204)] == [1, 2, 1]
-    words = {
-        number: text.item()
-        for number, text in read(path, "/explanation", "TextDocument:text").items()
-    }
-    policy = "deterministic" if deterministic else "stochastic"
-    for number, episode, step in ((192, 0, 0), (199, 0, 7), (215, 1, 11)):
-        head = f"Evaluation, episode {episode}, step {step} of 12, {policy} policy: **"
-        assert words[number].startswith(head)
-    assert words[160].startswith("**")
+    executed, steps = f"/stages/{last}/executed", range(12)
+    trained = read(path, executed, "Points2D:positions")
+    assert [step for step in trained if step >= 0] == [0, 160]
+    for number, episode in enumerate(episodes):
+        timeline = f"episode_{number}"
+        points = read(path, executed, "Points2D:positions", timeline)
+        assert [step for step in points if step >= 0] == list(steps)
+        for step in steps:
+            np.testing.assert_array_equal(points[step][-1], episode[step]["action"].numpy())
+        # An episode's return begins anew, and so does the first one's, whatever was before.
+        rewards = torch.stack([step["next", "reward"].squeeze() for step in episode]).double()
+        returns = read(path, "/series/return", "Scalars:scalars", timeline)
+        found = [returns[step].item() for step in steps]
+        np.testing.assert_allclose(found, rewards.cumsum(0).numpy())
+        trail = read(path, "/map/trail", "LineStrips2D:strips", timeline)
+        assert [len(trail[step][-1]) for step in (0, 1)] == [1, 2]
 
 
 def test_a_stream_that_fails_costs_no_results(
@@ -132,7 +126,7 @@ def test_a_stream_that_fails_costs_no_results(
     def fail(*_: Any) -> None:
         raise OSError("no stream")
 
-    monkeypatch.setattr("cnfp_torchrl.visual.rerun.run_stream.TrainingStream.on_episode", fail)
+    monkeypatch.setattr("cnfp_torchrl.visual.rerun.run_stream.EpisodeStream.__call__", fail)
     with pytest.raises(OSError, match="no stream"):
         tiny_run(*FILE)
     folder = RunFolder.open(tmp_path / "run1")
@@ -170,7 +164,8 @@ def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run
         tiny_run(*FILE, "training.warmup_frames=48", "visual.every=1", f"seed={seed}")
         for seed in (0, 0, 1)
     )
-    assert steps_of(one[0].path / "recording.rrd", "/explanation")[-12:] == list(range(192, 204))
+    path = one[0].path / "recording.rrd"
+    assert steps_of(path, "/explanation", "episode_0") == list(range(12))
     for key in ("return_mean", "violations", "evaluation"):
         assert one[1][key] == unwatched[1][key]
     states = [folder.load_checkpoint()["loss"] for folder in (one[0], unwatched[0])]
@@ -270,9 +265,10 @@ def test_an_episode_depends_on_its_seed_alone(tiny_run: Run, tmp_path: Path) -> 
     factory = instantiate({"_target_": "cnfp_torchrl.visual.rerun.RunStream", "episodes": 2})
     path = tmp_path / "recording.rrd"
     show_episodes(folder, EvaluationSettings(episodes=2), factory, path).close()
-    assert steps_of(path, "/explanation") == list(range(24))
-    words = read(path, "/explanation", "TextDocument:text")[19].item()
-    assert words.startswith("Evaluation, episode 1, step 7 of 12, stochastic policy: **")
+    for number in (0, 1):
+        assert steps_of(path, "/explanation", f"episode_{number}") == list(range(12))
+    words = read(path, "/explanation", "TextDocument:text", "episode_1")[7].item()
+    assert words.startswith("Trained policy, stochastic, episode 1, step 7 of 12: **")
 
 
 def test_an_endless_episode_is_cut_off(tiny_run: Run) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs import TaskView
+from cnfp_torchrl.envs import Component, TaskView
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet
 from cnfp_torchrl.visual import FlowSnapshot
 from cnfp_torchrl.visual.explanation import ConstraintEffect, Explanation, explain
@@ -44,7 +44,7 @@ def test_a_constraint_that_binds_is_restrictive() -> None:
     assert wall.after == pytest.approx((0.381, 0.762), abs=0.005)
     assert wall.moved == pytest.approx(0.381, abs=0.005)
     assert explanation.action == wall.after
-    assert "Wall moved the executed action by 0.38" in explanation.text()
+    assert "The wall constraint moved the action by 0.38" in explanation.text()
 
 
 def test_a_constraint_that_does_not_bind_is_permissive() -> None:
@@ -54,8 +54,8 @@ def test_a_constraint_that_does_not_bind_is_permissive() -> None:
     assert only(explanation).moved == 0
     assert only(explanation).share_allowed == 1
     assert only(explanation).before == only(explanation).after
-    assert "No constraint changed the executed action." in explanation.text()
-    assert "it changed none of 50 samples" in explanation.text()
+    assert "No constraint moved the action." in explanation.text()
+    assert "The far constraint moved none of 50 samples." in explanation.text()
 
 
 def test_a_constraint_can_bind_on_other_samples_alone() -> None:
@@ -69,16 +69,15 @@ def test_a_constraint_can_bind_on_other_samples_alone() -> None:
     share = only(explanation).share_moved
     assert share is not None
     assert share == pytest.approx(float(moved.any(-1).double().mean()), abs=0.02)
-    assert "it left the executed action as it was" in explanation.text()
+    assert "left the action where it was" in explanation.text()
 
 
 def test_a_constraint_that_cannot_hold_is_dropped() -> None:
     explanation = explain(make_snapshot(CONFLICT))
     assert effects(explanation) == {"far": "dropped", "near": "restrictive"}
-    assert "far: dropped, no action within the bounds keeps it together with near." in (
-        explanation.text()
-    )
-    assert "far is dropped" in explanation.markdown()
+    reason = "no action within the bounds keeps it together with near."
+    assert f"The far constraint is dropped: {reason}" in explanation.text()
+    assert "the far constraint is dropped" in explanation.markdown()
 
 
 def test_a_constraint_that_is_widened_is_relaxed() -> None:
@@ -106,7 +105,9 @@ def test_flows_that_guarantee_nothing_are_seen_to_break(flow: str) -> None:
             outside = ~allowed.contains(snapshot.stages[-1].samples)
             assert effect.share_outside == pytest.approx(float(outside.double().mean()))
     text = explain(snapshot).text()
-    assert ("is broken" in text) == ("broken" in effects(explain(snapshot)).values())
+    assert ("action breaks the " in text.replace("\n", " ")) == (
+        "broken" in effects(explain(snapshot)).values()
+    )
 
 
 def test_shares_are_areas() -> None:
@@ -137,10 +138,12 @@ def test_any_dimension_and_any_number_of_constraints(
     assert [each.name for each in explanation.constraints] == list(sets)
     assert len(explanation.action) == dim
     assert (explanation.share_allowed is None) == (dim > 3)
-    for said in (explanation.text(), explanation.markdown()):
-        assert all(name in said for name in sets)
-        assert "nan" not in said
-        assert "None" not in said
+    for text in (explanation.text(), explanation.markdown()):
+        assert all(name in text for name in sets)
+        assert "nan" not in text
+        assert "None" not in text
+        assert max(map(len, explanation.text().splitlines())) <= 100
+    assert all(component.title in explanation.text() for component in explanation.components)
 
 
 class Home(TaskView):
@@ -153,20 +156,31 @@ class Home(TaskView):
 
 def test_what_the_task_says_is_passed_on() -> None:
     explanation = explain(make_snapshot(LINE, dim=1), Home())
-    for said in (explanation.text(), explanation.markdown()):
-        assert "At home." in said
-        assert said.count("The end is near.") == 1
+    for text in (explanation.text().replace("\n", " "), explanation.markdown()):
+        assert "At home." in text
+        assert text.count("The end is near.") == 1
 
 
 def test_an_action_of_another_policy_has_no_way() -> None:
     explanation = explain(replace(make_snapshot(PLANE), is_recovered=False))
     assert explanation.latent is None
     assert all(each.before is None and each.moved is None for each in explanation.constraints)
-    assert "the way of the executed action is unknown" in explanation.text()
+    assert "the way of the action itself is unknown" in explanation.text()
 
 
 def test_markdown_is_a_table() -> None:
     lines = explain(make_snapshot({"a|b": PLANE["speed"]})).markdown().splitlines()
     rows = [line for line in lines if line.startswith("|")]
-    assert len(rows) == 6
-    assert {row.replace("\\|", "").count("|") for row in rows} == {7}
+    # Of the constraint and all together, and of two components; each with a head.
+    assert len(rows) == 4 + 4
+    counts = [row.replace("\\|", "").count("|") for row in rows]
+    assert counts == [7] * 4 + [6] * 4
+
+
+def test_names_and_units_are_those_of_the_task() -> None:
+    force = [Component("push", "N"), Component("lift", "N")]
+    text = explain(make_snapshot(PLANE), components=force).text()
+    for words in ("push (N)", "lift (N)", "moved (N)", "slack (N)"):
+        assert words in text
+    mixed = [Component("push", "N"), Component("turn", "N m")]
+    assert explain(make_snapshot(PLANE), components=mixed).unit == "action units"

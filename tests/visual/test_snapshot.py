@@ -102,7 +102,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("flow", ["exact", "gauge", "radial", "squash", "unconstrained"])
+@pytest.mark.parametrize(
+    "flow", ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
+)
 @pytest.mark.parametrize("case", CASES)
 def test_stages_are_the_flows_up_to_each(case: str, flow: str) -> None:
     sets, dim = CASES[case]
@@ -120,3 +122,21 @@ def test_stages_are_the_flows_up_to_each(case: str, flow: str) -> None:
         expected = bijector.inverse_and_log_det(actions[-1])
         given = latents[k], inverse_log_dets[k]
         torch.testing.assert_close(given, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+def test_a_saturated_policy_is_shown_by_what_the_flow_does_to_others() -> None:
+    saturated = make_snapshot(PLANE, loc=torch.tensor([6.0, -6.0]), scale=torch.full((2,), 0.1))
+    assert saturated.is_saturated
+    shown = saturated.with_standard_base()
+    assert not shown.is_saturated
+    assert shown.latents.shape == saturated.latents.shape
+    assert not shown.outside(len(shown.stages) - 1).any()
+    assert shown.latents.std(0).sub(1).abs().max() < 0.3
+
+
+def test_the_share_allowed_before_the_flow_is_counted() -> None:
+    snapshot = make_snapshot(PLANE)
+    squashed = torch.tanh(snapshot.latents)
+    inside = [constraint.contains(squashed) for constraint in snapshot.region.sets[1:]]
+    assert snapshot.share_allowed_before == torch.stack(inside).all(0).double().mean()
+    assert make_snapshot({}).share_allowed_before == 1

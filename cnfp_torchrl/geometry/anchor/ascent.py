@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.anchor.depth import bounds_of
 from cnfp_torchrl.geometry.box import Box
@@ -152,7 +151,8 @@ class Ascent:
             gradients.append(self.normals)
         for cone in self.cones:
             white = cone.vector + (cone.matrix * self.x).sum(1)
-            length = vector_norm(white, dim=0)
+            # Not `torch.linalg.vector_norm`, which is slow along the first dimension.
+            length = white.square().sum(0).sqrt()
             values.append(((cone.size - length) / cone.rate).unsqueeze(0))
             # At the tip of the cone the gradient is 0, and the curvature would be infinite.
             length = torch.maximum(length, 1e-3 * cone.size + torch.finfo(length.dtype).tiny)
@@ -223,14 +223,11 @@ class Ascent:
     def _cone(self, part: Cone, middle: Tensor, half: Tensor) -> _Cone:
         matrix = part.matrix * half.unsqueeze(-2)
         vector = part.vector + (part.matrix * middle.unsqueeze(-2)).sum(-1)
-        relative = matrix / part.rate[..., None, None]
-        return _Cone(
-            self._last(matrix, 2),
-            self._last(vector),
-            self._last(part.size, 0),
-            self._last(part.rate, 0),
-            self._last(relative.mT @ relative, 2),
-        )
+        matrix, rate = self._last(matrix, 2), self._last(part.rate, 0)
+        relative = matrix / rate
+        # (B, d, d) would be multiplied one by one.
+        square = (relative.unsqueeze(1) * relative.unsqueeze(2)).sum(0)
+        return _Cone(matrix, self._last(vector), self._last(part.size, 0), rate, square)
 
     def _sum(self, part: KinkedSum) -> tuple[Tensor, Tensor, Tensor]:
         free = part.rate == 0

@@ -261,54 +261,47 @@ class ConeScaling(NamedTuple):
         return result / size[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """Matrices ``S^T S``, factorized as ``U^T D U`` where they are small.
+class _Normal(NamedTuple):
+    """Matrices ``S^T S``, inverted where they are small: what that costs in accuracy is one step's.
 
     Args:
-        matrix: matrices ``(B, n, n)``, if they are not factorized.
-        rows: rows of U right of its diagonal of ones.
-        diagonal: diagonal of D, ``(B,)`` each.
+        matrix: matrices ``(B, n, n)``, or their inverses ``(n, n, B)``.
+        inverted: whether they are inverses.
     """
 
-    matrix: Array | None
-    rows: list[Array]
-    diagonal: list[Array]
+    matrix: Array
+    inverted: bool
 
     @classmethod
     def of(cls, scaled: Array) -> Self:
         """Return the matrices for S, ``(m, n, B)``."""
-        if scaled.shape[1] > _SMALL:
+        each = np.arange(scaled.shape[1])
+        if len(each) > _SMALL:
             first = np.ascontiguousarray(scaled.transpose(2, 0, 1))
             matrix = first.transpose(0, 2, 1) @ first
             # Rounding may have made a matrix singular.
-            each = np.arange(scaled.shape[1])
             matrix[:, each, each] *= 1 + 1e-14
             # Of problems that went on after they were settled, which no longer count.
             matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
-            return cls(matrix, [], [])
-        rest = np.einsum("mib,mjb->ijb", scaled, scaled)
-        rows, diagonal = [], []
-        for least in 1e-15 * np.einsum("iib->ib", rest):
+            return cls(matrix, inverted=False)
+        inverse = np.einsum("mib,mjb->ijb", scaled, scaled)
+        least = 1e-15 * inverse[each, each]
+        for k in each:
             # Where rounding made a matrix indefinite, t still grows along the direction.
-            pivot = np.maximum(rest[0, 0], least)
-            row = rest[0, 1:] / pivot
-            rest = rest[1:, 1:] - rest[1:, :1] * row
-            rows.append(row)
-            diagonal.append(pivot)
-        return cls(None, rows, diagonal)
+            pivot = np.maximum(inverse[k, k], least[k])
+            column, row = inverse[:, k] / pivot, inverse[k].copy()
+            inverse -= column[:, None] * row
+            inverse[k] = row / pivot
+            inverse[:, k] = -column
+            inverse[k, k] = 1 / pivot
+        return cls(inverse, inverted=True)
 
     def solve(self, right: Array) -> Array:
         """Return the solutions for right-hand sides ``(n, B)``."""
-        if self.matrix is not None:
-            solution = np.linalg.solve(self.matrix, right.T[..., None])
-            return np.asarray(solution[..., 0].T, dtype=np.float64)
-        x = right.copy()
-        for i, row in enumerate(self.rows):
-            x[i + 1 :] -= row * x[i]
-        for i in range(len(x) - 1, -1, -1):
-            x[i] = x[i] / self.diagonal[i] - (self.rows[i] * x[i + 1 :]).sum(0)
-        return x
+        if self.inverted:
+            return times(self.matrix, right)
+        solution = np.linalg.solve(self.matrix, right.T[..., None])
+        return np.asarray(solution[..., 0].T, dtype=np.float64)
 
 
 def _pulled(matrix: Array, weights: Array) -> Array:

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import (
     Boxes,
+    Component,
     Discs,
     Map,
     Marks,
@@ -55,6 +56,14 @@ class PointNavView(TaskView):
         self.map = _map(layout)
         self.series = [Series("battery", "%", layout.battery_threshold, (0, BATTERY_FULL))]
         self.position_keys = [self._key]
+        self.action_components = [Component("right"), Component("up")]
+        self.observation_components = [
+            Component("x", "arena units"),
+            Component("y", "arena units"),
+            Component("battery / 100"),
+            Component("goal x", "arena units"),
+            Component("goal y", "arena units"),
+        ]
         self.state_setter = set_state
 
     @cached_property
@@ -75,8 +84,8 @@ class PointNavView(TaskView):
         to_goal = float(vector_norm(self.goal(state) - position))
         x, y = position.tolist()
         return (
-            f"At ({x:.3f}, {y:.3f}), battery {int(charge)} %, goal {to_goal:.3f} away "
-            f"({to_goal / self._layout.step_length:.1f} steps)."
+            f"At ({x:.3f}, {y:.3f}) arena units, battery {int(charge)} %, goal {to_goal:.3f} arena "
+            f"units away ({to_goal / self._layout.step_length:.1f} steps)."
         )
 
     @torch.no_grad()
@@ -128,11 +137,12 @@ class PointNavView(TaskView):
         if left < 0:
             charge = f"The charge is below the threshold of {layout.battery_threshold} %"
         else:
-            charge = f"{left} steps are left above {layout.battery_threshold} %"
+            steps = "1 step is" if left == 1 else f"{left} steps are"
+            charge = f"{steps} left above {layout.battery_threshold} %"
         if not bool(way.found):
             return f"{charge}, and no way to a station was found."
-        zone = "in its zone" if needed == 0 else f"{needed} steps to its zone"
-        return f"{charge}; the way to the nearest station is {length:.3f} long, {zone}."
+        zone = f"{_steps(needed)} to its zone" if needed else "in its zone"
+        return f"{charge}; the way to the nearest station is {length:.3f} arena units long, {zone}."
 
 
 def set_state(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
@@ -201,4 +211,8 @@ def _beside_rectangles(layout: Layout, shape: torch.Size, generator: torch.Gener
 
 
 def _length(length: float, step: float) -> str:
-    return f"{length:.3f} ({length / step:.1f} steps)"
+    return f"{length:.3f} arena units ({length / step:.1f} steps)"
+
+
+def _steps(count: int) -> str:
+    return "1 step" if count == 1 else f"{count} steps"

@@ -12,21 +12,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from cnfp_torchrl.visual.colors import INK, MUTED, constraint_colors
+from cnfp_torchrl.visual.colors import GOAL, INK, MUTED, constraint_colors
 from cnfp_torchrl.visual.figures.canvas import house_style, message_figure, new_figure, say
 
 Curve: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Steps and values."""
 
-RETURN, VIOLATIONS = "train/return", "violations/"
+RETURN, EVALUATED, VIOLATIONS = "train/return", "evaluation/return", "violations/"
 TIMES = ("train/steps_per_second", "train/seconds", "train/processor_seconds")
 """Of the machine, not of learning: not drawn."""
 
 RELAXATIONS = {
     "relaxed/": "share of steps relaxed",
     "dropped/": "share of steps dropped",
-    "relaxation/": "largest relaxation (units of slack)",
-    "mean_relaxation/": "mean relaxation (units of slack)",
+    "relaxation/": "largest relaxation (action units)",
+    "mean_relaxation/": "mean relaxation (action units)",
 }
 """What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
 
@@ -90,7 +90,8 @@ def learning_curves(
     others = {
         name: curve
         for name, curve in curves.items()
-        if name not in (RETURN, *TIMES) and not name.startswith((VIOLATIONS, *RELAXATIONS))
+        if name not in (RETURN, EVALUATED, *TIMES)
+        and not name.startswith((VIOLATIONS, *RELAXATIONS))
     }
     panels = 2 + len(relaxations) + len(others)
     rows = -(-panels // _COLUMNS)
@@ -100,7 +101,7 @@ def learning_curves(
         figure = new_figure(3.3 * columns, 2.5 * rows + 0.4)
         figure.suptitle(title)
         axes = [figure.add_subplot(rows, columns, 1 + i) for i in range(panels)]
-        _draw_return(axes[0], curves.get(RETURN))
+        _draw_return(axes[0], curves.get(RETURN), curves.get(EVALUATED))
         named = {name for group in (counted, *relaxations.values()) for name in group}
         colors = dict(colors or constraint_colors(sorted(named)))
         _draw_violations(axes[1], counted, colors)
@@ -127,12 +128,16 @@ def _title(name: str) -> str:
     return _TITLES.get(last, last.replace("_", " "))
 
 
-def _draw_return(axes: Axes, curve: Curve | None) -> None:
+def _draw_return(axes: Axes, curve: Curve | None, evaluated: Curve | None) -> None:
     axes.set_title("mean return of an episode")
-    if curve is None:
-        say(axes, "no episode ended\nbetween two entries of the log")
-    else:
+    if curve is not None:
         _plot(axes, curve)
+        axes.lines[-1].set_label("training")
+    if evaluated is not None:
+        axes.plot(*evaluated, color=GOAL, linewidth=1.4, marker="o", ms=3.5, label="evaluation")
+        axes.legend(loc="best")
+    elif curve is None:
+        say(axes, "no episode ended\nbetween two entries of the log")
 
 
 def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[str, str]) -> None:

@@ -26,6 +26,10 @@ from cnfp_torchrl.visual.snapshot import FlowSnapshot, take_snapshot
 from cnfp_torchrl.visual.states import telling_states
 
 METRICS, FIGURES = "metrics", "figures"
+_TITLES = {
+    "permissive": "Most permissive state that was seen",
+    "restrictive": "State in which constraints bind",
+}
 
 
 def draw_run_figures(
@@ -73,9 +77,12 @@ def _figures(folder: RunFolder, config: DictConfig, episodes: int) -> dict[str, 
         return figures  # the stages of a flow are drawn with their densities
     for kind, state in zip(("permissive", "restrictive"), telling_states(env, head), strict=True):
         snapshot = take_snapshot(actor, state, seed=config.seed)
+        title = f"{_TITLES[kind]}{_openness(snapshot)} · {run}"
+        if snapshot.is_saturated:
+            snapshot = snapshot.with_standard_base(config.seed)
+            title += "\nthe policy is saturated: samples of N(0, 1) in its place"
         if kind == "restrictive":
             snapshot = snapshot.following_the_longest_path()
-        title = f"{kind.capitalize()} state{_openness(snapshot)} · {run}"
         figures[f"flow_{kind}"] = flow_stages(snapshot, view=view, colors=colors, title=title)
     return figures
 
@@ -98,8 +105,8 @@ def _environment(config: DictConfig, batch: int | None = None) -> TransformedEnv
 
 
 def _openness(snapshot: FlowSnapshot) -> str:
-    share, told = explain(snapshot).share_allowed, ""
+    share, title = explain(snapshot).share_allowed, ""
     if share is not None:
-        told = f": {'all' if share == 1 else f'{100 * share:.0f} % of'} actions allowed"
+        title = f": {'all' if share == 1 else f'{100 * share:.0f} % of'} actions allowed"
     dropped = " and ".join(snapshot.dropped)
-    return f"{told}, {dropped} cannot hold" if dropped else told
+    return f"{title}, {dropped} cannot hold" if dropped else title

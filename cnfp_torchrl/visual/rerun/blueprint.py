@@ -8,25 +8,30 @@ import rerun.blueprint as rrb
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.envs import can_render
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.rerun import style
 from cnfp_torchrl.visual.rerun.painters import HEIGHTS_IN_ONE, legend_size
+from cnfp_torchrl.visual.rerun.series import Plot, flow_plots, task_plots
 from cnfp_torchrl.visual.rerun.style import (
     EXPLANATION,
     LEGEND,
     MAP,
     METRICS,
-    SERIES,
+    PICTURE,
     TIMELINE,
+    series_path,
     stage_path,
 )
-from cnfp_torchrl.visual.setting import Setting, StageView
+from cnfp_torchrl.visual.setting import Setting, StageView, pair_name
 
 _STAGES_IN_LINE = 4
+_ROWS_AT_ONCE = 3
+_MOST_IN_LEGEND = 8
 _STEPS_PER_SECOND = 8.0
 
 TRAINING_PLOTS: Mapping[str, Sequence[str]] = {
-    "Training: return": ["train/return"],
+    "Training and evaluation: return": ["train/return", "evaluation/return"],
     "Training: losses": ["loss/**"],
     "Training: alpha": ["train/alpha"],
     "Training: entropy": ["train/entropy"],
@@ -43,11 +48,13 @@ def flow_blueprint(
     *,
     projections: Sequence[Sequence[int]] | None = None,
     training: Mapping[str, Sequence[str]] | None = None,
+    timeline: str = TIMELINE,
 ) -> rrb.Blueprint:
     """Return the arrangement of an actor's stream.
 
-    The map stands on the left, where there is one, then the stages in order of application, a row
-    for each projection, and the explanation; time series run below.
+    The environment's picture and map stand on the left, where there are such, then the stages in
+    order of application, a row for each projection, and the explanation. Below run the plots of
+    what the constraints did, of the task, and of the training, with one time axis for all.
 
     Args:
         actor: as given to `FlowStream`.
@@ -55,25 +62,27 @@ def flow_blueprint(
         projections: as given to `FlowStream`.
         training: titles of plots over training and the names of what is in them, as given to
             `RerunLogger`, such as `TRAINING_PLOTS`; None: none.
+        timeline: that is shown first.
     """
     setting = Setting.of(flow_head(actor), env, projections)
-    rows = [_row(setting, row) for row in setting.rows()]
-    stages = rows[0] if len(rows) == 1 else rrb.Vertical(*rows)
     explanation = rrb.TextDocumentView(origin=f"/{EXPLANATION}", name="What happened in this step")
-    if setting.view.map is None:
-        beside = rrb.Vertical(explanation, _legend(setting), row_shares=[4, 1])
-        above = rrb.Horizontal(stages, beside, column_shares=[2.5, 1])
-    else:
-        side = rrb.Vertical(_map(), _legend(setting), row_shares=[4.6, 1])
-        beside = rrb.Vertical(stages, explanation, row_shares=[5, 3.8])
-        above = rrb.Horizontal(side, beside, column_shares=[1, 2])
-    plots = [rrb.Horizontal(*_episode(setting))]
+    views = [_map()] if setting.view.map else [_picture()] if can_render(env) else [explanation]
+    side = rrb.Vertical(*views, _legend(setting), row_shares=[4.6, 1])
+    stages = _stages(setting)
+    if views[0] is not explanation:
+        # More rows of stages leave less room for words.
+        shares = [5, 3.8] if len(setting.rows()) == 1 else [5, 2.2]
+        stages = rrb.Vertical(stages, explanation, row_shares=shares)
+    above = rrb.Horizontal(side, stages, column_shares=[1, 2])
+    task: rrb.Container = rrb.Horizontal(*map(_plot, task_plots(setting)), name="Task")
     if training:
-        plots.append(rrb.Horizontal(*(_metrics(*each) for each in training.items())))
+        metrics = (_metrics(*titled) for titled in training.items())
+        task = rrb.Tabs(task, rrb.Horizontal(*metrics, name="Training"))
+    flow = rrb.Horizontal(*map(_plot, flow_plots(setting)), name="Constraints")
     return rrb.Blueprint(
-        rrb.Vertical(above, *plots, row_shares=[4.4] + [1.0] * len(plots)),
+        rrb.Vertical(above, flow, task, row_shares=[5, 1, 1.2]),
         rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, play_state="following", fps=_STEPS_PER_SECOND
+            state="collapsed", timeline=timeline, play_state="following", fps=_STEPS_PER_SECOND
         ),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -81,6 +90,16 @@ def flow_blueprint(
         auto_views=False,
         auto_layout=False,
     )
+
+
+def _stages(setting: Setting) -> rrb.Container:
+    """Return a row of views for each projection; of many, some at a time."""
+    rows, pages = setting.rows(), []
+    for first in range(0, len(rows), _ROWS_AT_ONCE):
+        shown = rows[first : first + _ROWS_AT_ONCE]
+        name = " · ".join(pair_name(row[0].components) for row in shown)
+        pages.append(rrb.Vertical(*(_row(setting, row) for row in shown), name=name))
+    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages)
 
 
 def _row(setting: Setting, row: list[StageView]) -> rrb.Container:
@@ -99,6 +118,10 @@ def _map() -> rrb.Spatial2DView:
         # In half widths of the map, as it is drawn.
         visual_bounds=rrb.VisualBounds2D(x_range=[-1.04, 1.04], y_range=[-1.04, 1.04]),
     )
+
+
+def _picture() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin=f"/{PICTURE}", name="Environment")
 
 
 def _legend(setting: Setting) -> rrb.Spatial2DView:
@@ -124,12 +147,14 @@ def _stage(setting: Setting, view: StageView) -> rrb.Spatial2DView:
     )
 
 
-def _episode(setting: Setting) -> list[rrb.TimeSeriesView]:
-    views = [_series("reward", "Reward"), _series("return", "Return so far")]
-    if setting.costs:
-        views.append(_series("costs", "Violations so far", legend=True))
-    views += [_series(each.name, each.title, span=each.limits) for each in setting.view.series]
-    return [*views, _series("entropy", "Entropy (nats)")]
+def _plot(plot: Plot) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=f"/{series_path(plot.name)}",
+        name=plot.title,
+        plot_legend=rrb.PlotLegend("LeftTop", visible=1 < len(plot.curves) <= _MOST_IN_LEGEND),
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
+    )
 
 
 def _metrics(title: str, names: Sequence[str]) -> rrb.TimeSeriesView:
@@ -139,15 +164,5 @@ def _metrics(title: str, names: Sequence[str]) -> rrb.TimeSeriesView:
         contents=contents,
         name=title,
         plot_legend=rrb.PlotLegend("LeftTop", visible=True),
-    )
-
-
-def _series(
-    name: str, title: str, *, legend: bool = False, span: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin=f"/{SERIES}/{name}",
-        name=title,
-        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
-        axis_y=None if span is None else rrb.ScalarAxis(range=span),
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
     )

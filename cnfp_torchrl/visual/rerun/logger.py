@@ -83,7 +83,7 @@ class RerunLogger(Logger):
         values = np.atleast_1d(np.asarray(torch.as_tensor(value).detach().cpu(), dtype=np.float64))
         self._set_step(name, step)
         if not np.isfinite(values).all():
-            given = ", ".join(f"{each:g}" for each in values)
+            given = ", ".join(f"{number:g}" for number in values)
             self._log("warnings", rr.TextLog(f"{name} is {given}", level=rr.TextLogLevel.WARN))
             return
         self._log(name, rr.Scalars(values))
@@ -138,8 +138,10 @@ class RerunLogger(Logger):
         self._set_step(name, step)
         finite = values[np.isfinite(values)]
         if len(finite) < len(values):
-            said = f"{len(values) - len(finite)} of {len(values)} values of {name} are not finite"
-            self._log("warnings", rr.TextLog(said, level=rr.TextLogLevel.WARN))
+            message = (
+                f"{len(values) - len(finite)} of {len(values)} values of {name} are not finite"
+            )
+            self._log("warnings", rr.TextLog(message, level=rr.TextLogLevel.WARN))
         counts, edges = np.histogram(finite, **kwargs)
         middles = (edges[:-1] + edges[1:]) / 2
         self._log(name, rr.BarChart(counts, abscissa=middles))
@@ -169,6 +171,8 @@ class RerunLogger(Logger):
         if step is None:
             step = self._steps.get(name, -1) + 1
         self._steps[name] = int(step)
+        # Streams of episodes count on timelines of their own.
+        self.experiment.reset_time()
         self.experiment.set_time(TIMELINE, sequence=int(step))
 
     def _log(self, name: str, archetype: rr.AsComponents, *, static: bool = False) -> None:
@@ -179,9 +183,9 @@ class RerunLogger(Logger):
 def _plain(value: Any) -> Any:
     """Return mappings and lists of any kind as those of Python."""
     if isinstance(value, Mapping) or hasattr(value, "items"):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [_plain(each) for each in value]
+        return [_plain(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value

@@ -1,9 +1,8 @@
-"""Painters of a scene's parts: stages, map, time series and legend, from the scene's arrays."""
+"""Painters of a scene's parts: stages, map and legend, from the scene's arrays."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -13,7 +12,6 @@ from rerun.components import ImageFormat
 from tensordict import TensorDictBase
 
 from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Shape
-from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
 from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.rerun import entities, style
@@ -299,83 +297,6 @@ class MapPainter:
             )
 
 
-class SeriesPainter:
-    """Time series of an episode: reward, return, costs, entropy, and those of the task.
-
-    Args:
-        stream: where to log; names and colors are logged at once.
-        setting: with the costs' names, the constraints' colors and the task's series.
-    """
-
-    def __init__(self, stream: rr.RecordingStream, setting: Setting) -> None:
-        self._stream, self._setting = stream, setting
-        self._return = 0.0
-        self._costs = [0.0] * len(setting.costs)
-        self._reward: float | None = None
-        self._log_styles()
-
-    def follow(self, transition: TensorDictBase) -> None:
-        """Add a step to the sums; of every step, logged or not."""
-        reward = transition.get(("next", REWARD_KEY), None)
-        self._reward = None if reward is None else float(reward.sum())
-        self._return += self._reward or 0.0
-        cost = transition.get(("next", COST_KEY), None)
-        if cost is not None and self._costs:
-            self._costs = [a + b for a, b in zip(self._costs, cost.tolist(), strict=True)]
-
-    def end_episode(self) -> None:
-        """Begin the sums anew."""
-        self._return, self._costs = 0.0, [0.0] * len(self._costs)
-
-    def log(self, scene: Scene) -> None:
-        """Log one step that was followed."""
-        if self._reward is not None:
-            self._log("reward", [self._reward])
-            self._log("return", [self._return])
-        if self._costs:
-            self._log("costs", self._costs)
-        self._log("entropy", [scene.entropy])
-        view = self._setting.view
-        if view.series:
-            values = view.series_values(scene.snapshot.state)
-            for series in view.series:
-                threshold = [] if series.threshold is None else [series.threshold]
-                self._log(series.name, [float(values[series.name]), *threshold])
-
-    def _log(self, name: str, values: Sequence[float]) -> None:
-        self._stream.log(f"{style.SERIES}/{name}", entities.scalars(values))
-
-    def _log_styles(self) -> None:
-        setting = self._setting
-        styles = {
-            "reward": ([style.REWARD], ["reward"]),
-            "return": ([style.PALE], ["return so far"]),
-            "entropy": ([style.SAMPLE], ["entropy (nats)"]),
-        }
-        if self._costs:
-            styles["costs"] = ([self._color(n) for n in setting.costs], list(setting.costs))
-        for series in setting.view.series:
-            colors, names = [self._color(series.name)], [series.name]
-            if series.threshold is not None:
-                colors, names = [*colors, style.MUTED], [*names, "threshold"]
-            styles[series.name] = (colors, names)
-        for name, (colors, names) in styles.items():
-            self._stream.log(
-                f"{style.SERIES}/{name}",
-                rr.SeriesLines(colors=colors, names=names, widths=[2.0] * len(names)),
-                static=True,
-            )
-        for name, color in setting.colors.items():
-            for metric in ("violations/", "train/lambda_", "relaxed/", "dropped/", "relaxation/"):
-                line = rr.SeriesLines(colors=rgb(color), names=name)
-                path = rr.new_entity_path([style.METRICS, *f"{metric}{name}".split("/")])
-                self._stream.log(path, line, static=True)
-
-    def _color(self, name: str) -> style.Color:
-        """Return the color of the constraint of this name, or a muted one."""
-        return rgb(self._setting.colors.get(name, "#8A8A8A"))
-
-
 def legend_size(setting: Setting) -> tuple[float, float]:
     """Return width and height of the legend."""
     rows = -(-len(_legend(setting)) // _LEGEND_COLUMNS)
@@ -408,7 +329,7 @@ def _legend(setting: Setting) -> dict[str, style.Color]:
         "samples of the policy": style.SAMPLE,
         "allowed so far": style.PALE,
         **{f"{name} set": rgb(color) for name, color in setting.colors.items()},
-        "density": style.GLOW,
+        **({"density": style.GLOW} if setting.dim <= 2 else {}),
         "samples outside": style.BREAKS,
     }
     if setting.view.map is not None:

@@ -10,12 +10,15 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
+from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.rerun.blueprint import TRAINING_PLOTS, flow_blueprint
 from cnfp_torchrl.visual.rerun.hooks import StreamHook
 from cnfp_torchrl.visual.rerun.logger import RerunLogger
 from cnfp_torchrl.visual.rerun.recording import Recording, open_recording
 from cnfp_torchrl.visual.rerun.stream import FlowStream
+from cnfp_torchrl.visual.rerun.style import TIMELINE, episode_timeline
 from cnfp_torchrl.visual.rerun.viewers import Viewer
+from cnfp_torchrl.visual.setting import Setting
 
 _CLOCKS = ("train/seconds", "train/processor_seconds", "train/steps_per_second")
 """Scalars that differ between two runs of one seed, whose recordings must not."""
@@ -27,8 +30,9 @@ class RunStream:
     Args:
         viewer: None for the file alone.
         every: in training, every n-th step of the first agent.
-        episodes: how many episodes of an evaluation, each with all its steps.
-        deterministic: in an evaluation, the deterministic policy and not the stochastic one.
+        episodes: how many episodes of the trained policy, each with all its steps.
+        deterministic: in these, the deterministic policy and not the stochastic one.
+        render_every: in these, how many steps lie between two pictures of the environment; 0: none.
         samples: how many actions to draw in each step.
         projections: pairs of action components, for actions of more than two.
 
@@ -43,6 +47,7 @@ class RunStream:
         every: int = 10,
         episodes: int = 1,
         deterministic: bool = False,
+        render_every: int = 5,
         samples: int = 512,
         projections: Sequence[Sequence[int]] | None = None,
     ) -> None:
@@ -53,6 +58,7 @@ class RunStream:
         self.every = every
         self.episodes = episodes
         self.deterministic = deterministic
+        self.render_every = render_every
         self._samples = samples
         self._projections = projections
 
@@ -64,12 +70,9 @@ class RunStream:
         Raises:
             SinkError: when file or viewer cannot be had.
         """
-        recording = self._open(path, actor, env, TRAINING_PLOTS)
-
-        def episodes(step: int) -> EpisodeStream:
-            return EpisodeStream(self._stream(recording, actor, env, 1), self._policy, step)
-
-        return TrainingStream(recording, self._stream(recording, actor, env, self.every), episodes)
+        recording, stream = self._open(path, actor, env, TRAINING_PLOTS)
+        training = stream(self.every, TIMELINE)
+        return TrainingStream(recording, training, EpisodeStream(stream, self._policy))
 
     def for_evaluation(
         self, path: Path, actor: SafeProbabilisticTensorDictSequential, env: EnvBase
@@ -79,8 +82,7 @@ class RunStream:
         Raises:
             SinkError: when file or viewer cannot be had.
         """
-        recording = self._open(path, actor, env, None)
-        stream = self._stream(recording, actor, env, 1)
+        recording, stream = self._open(path, actor, env, None)
         return EvaluationStream(recording, EpisodeStream(stream, self._policy))
 
     @property
@@ -93,88 +95,73 @@ class RunStream:
         actor: SafeProbabilisticTensorDictSequential,
         env: EnvBase,
         plots: Mapping[str, Sequence[str]] | None,
-    ) -> Recording:
-        return open_recording(
+    ) -> tuple[Recording, Callable[[int, str], FlowStream]]:
+        """Return an open recording, and what makes its streams: of every n-th step, a timeline."""
+        setting = Setting.of(flow_head(actor), env, self._projections)
+        first = TIMELINE if plots else episode_timeline(0)
+        blueprint = flow_blueprint(
+            actor, env, projections=self._projections, training=plots, timeline=first
+        )
+        recording = open_recording(
             path,
             viewer=self.viewer,
             recording_id=str(path.parent.resolve()),
-            blueprint=flow_blueprint(actor, env, projections=self._projections, training=plots),
+            blueprint=blueprint,
         )
 
-    def _stream(
-        self,
-        recording: Recording,
-        actor: SafeProbabilisticTensorDictSequential,
-        env: EnvBase,
-        every: int,
-    ) -> FlowStream:
-        """Return a stream to a recording, which is closed where there can be none."""
-        try:
+        def stream(every: int, timeline: str) -> FlowStream:
             return FlowStream(
                 recording,
                 actor,
-                env,
-                projections=self._projections,
                 samples=self._samples,
                 every=every,
+                timeline=timeline,
+                setting=setting,
             )
-        except BaseException:
-            recording.close()
-            raise
+
+        return recording, stream
 
 
 class EpisodeStream:
-    """Stream whole episodes of an evaluation, one after another on the timeline.
+    """Stream whole episodes, each on a timeline of its own.
 
     Args:
-        stream: of the policy.
+        stream: returns a stream of every n-th step on a timeline.
         policy: ``stochastic`` or ``deterministic``.
-        step: of the first transition, on the timeline.
     """
 
-    def __init__(self, stream: FlowStream, policy: str, step: int = 0) -> None:
+    def __init__(self, stream: Callable[[int, str], FlowStream], policy: str) -> None:
         self._stream, self._policy = stream, policy
-        self._next_step = step
-        self._episode = 0
+        self._number = 0
 
     def __call__(self, episode: Sequence[TensorDictBase]) -> None:
         """Stream the transitions of the next episode."""
-        for number, transition in enumerate(episode):
+        stream = self._stream(1, episode_timeline(self._number))
+        for step, transition in enumerate(episode):
             # Counted from 0, as ``cnfp-explain`` does.
-            position = f"episode {self._episode}, step {number} of {len(episode)}"
-            heading = f"Evaluation, {position}, {self._policy} policy"
-            self._stream.log_step(self._next_step, transition, heading)
-            self._next_step += 1
-        self._episode += 1
+            position = f"episode {self._number}, step {step} of {len(episode)}"
+            stream.log_step(step, transition, f"Trained policy, {self._policy}, {position}")
+        self._number += 1
 
 
 class TrainingStream:
-    """Stream the first agent of every batch, the log's scalars, and episodes behind them.
+    """Stream the first agent of every batch, the log's scalars, and episodes when it is trained.
 
     Args:
         recording: closed with this.
         stream: of the collector's policy.
-        episodes: returns the stream of episodes that begin at a step of the timeline.
+        episodes: the stream of episodes.
     """
 
-    def __init__(
-        self, recording: Recording, stream: FlowStream, episodes: Callable[[int], EpisodeStream]
-    ) -> None:
+    def __init__(self, recording: Recording, stream: FlowStream, episodes: EpisodeStream) -> None:
         self.loggers = [_SeededLogger("recording", stream=recording.stream)]
         self.on_batch = StreamHook(stream)
+        self.on_episode = episodes
         self._recording = recording
-        self._make_episodes = episodes
-        self._episodes: EpisodeStream | None = None
 
     def continue_at(self, frames: int) -> None:
         """Go on along the timeline after as many steps of all agents."""
         self.on_batch.frames = frames
-
-    def on_episode(self, episode: Sequence[TensorDictBase]) -> None:
-        """Stream the transitions of an episode, behind all that was seen before."""
-        if self._episodes is None:
-            self._episodes = self._make_episodes(self.on_batch.frames)
-        self._episodes(episode)
 
     def close(self) -> None:
         """Finish the recording."""

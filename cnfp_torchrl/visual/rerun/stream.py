@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.keys import COST_KEY, REWARD_KEY
+from cnfp_torchrl.keys import COST_KEY, PIXELS_KEY, REWARD_KEY
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.rerun import entities
@@ -22,13 +22,15 @@ from cnfp_torchrl.visual.rerun.painters import (
     LinePainter,
     MapPainter,
     PlanePainter,
-    SeriesPainter,
     log_legend,
 )
-from cnfp_torchrl.visual.rerun.style import EXPLANATION, TIMELINE
+from cnfp_torchrl.visual.rerun.series import SeriesPainter
+from cnfp_torchrl.visual.rerun.style import EXPLANATION, PICTURE, TIMELINE
 from cnfp_torchrl.visual.scene import Detail, Scene
 from cnfp_torchrl.visual.setting import Setting
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
+
+_JPEG_QUALITY = 85
 
 
 class Recording(Protocol):
@@ -39,10 +41,11 @@ class Recording(Protocol):
 
 
 class FlowStream:
-    """Stream what a flow policy does to Rerun, step by step, on the timeline ``env_step``.
+    """Stream what a flow policy does to Rerun, step by step.
 
-    For each step: the task's map, if there is one, with the allowed moves in place; for each stage
-    of the flow its samples, density, sets and the executed action's path; an explanation; series.
+    For each step: the environment's picture at ``pixels``, where it has one; the task's map, if
+    there is one, with the allowed moves in place; for each stage of the flow its samples, density,
+    sets and the executed action's path; an explanation; series.
     The base samples are the same in all steps, so that pictures of successive steps compare, and no
     random numbers of the run are used. The same steps give the same recording, byte for byte.
 
@@ -54,10 +57,12 @@ class FlowStream:
         env: shows its task (`cnfp_torchrl.envs`) and says what the costs are called;
             None: neither is shown.
         projections: pairs of action components, counted from 0, a row of views for each, for
-            actions of more than two components; None shows the first two.
+            actions of more than two components; None shows each component once.
         samples: how many actions to draw in each step.
         every: log every n-th step, the first one included; returns, costs and the trail count all.
         cells: of the density's grid along each axis.
+        timeline: that the steps are counted on.
+        setting: what to show, as another stream's `setting`; None finds it by env and projections.
 
     Raises:
         ValueError: for a number below 1, a projection that is none, or a flow without density.
@@ -73,14 +78,19 @@ class FlowStream:
         samples: int = 512,
         every: int = 1,
         cells: int = 40,
+        timeline: str = TIMELINE,
+        setting: Setting | None = None,
     ) -> None:
         for name, value in (("samples", samples), ("every", every), ("cells", cells)):
             if value < 1:
                 raise ValueError(f"{name}: expected a number >= 1, given {value}")
         stream = recording if isinstance(recording, rr.RecordingStream) else recording.stream
-        setting = Setting.of(flow_head(actor), env, projections)
-        self._stream, self._actor, self._setting, self._every = stream, actor, setting, every
-        self._process = os.getpid()
+        if setting is None:
+            setting = Setting.of(flow_head(actor), env, projections)
+        self._stream, self._actor, self._every = stream, actor, every
+        self.setting = setting
+        """What the pictures of all steps have in common."""
+        self._timeline, self._process = timeline, os.getpid()
         self._calls = 0
         generator = torch.Generator().manual_seed(0)
         noise = torch.randn(samples, setting.dim, generator=generator)
@@ -119,7 +129,7 @@ class FlowStream:
     @property
     def counted_keys(self) -> list[NestedKey]:
         """What is read of a step that is only counted, where it is there."""
-        position = [] if self._map is None else self._setting.view.position_keys
+        position = [] if self._map is None else self.setting.view.position_keys
         return [*self._checked, ("next", "done"), *position]
 
     @torch.no_grad()
@@ -127,7 +137,7 @@ class FlowStream:
         """Log one step, or only count it where it is not every n-th one.
 
         Args:
-            step: of the environment, on the timeline ``env_step``.
+            step: of the environment, on the stream's timeline.
             transition: of batch size ``()``: the state with its geometry, the executed action, the
                 policy's location and scale, and reward, cost and done under ``next``.
             heading: begins the explanation, such as with the episode that the step belongs to.
@@ -154,7 +164,10 @@ class FlowStream:
         if self._map is not None:
             self._map.follow(transition)
         if self.is_due:
-            self._stream.set_time(TIMELINE, sequence=step)
+            # What another stream of this thread has set would go on counting there.
+            self._stream.reset_time()
+            self._stream.set_time(self._timeline, sequence=step)
+            self._log_picture(transition.get(PIXELS_KEY, None))
             self._log_scene(replay_step(self._actor, transition, self._noise), heading)
         self._calls += 1
         done = transition.get(("next", "done"), None)
@@ -163,8 +176,15 @@ class FlowStream:
             if self._map is not None:
                 self._map.end_episode()
 
+    def _log_picture(self, pixels: Tensor | None) -> None:
+        if pixels is None:
+            return
+        # Some environments put the channels first, as networks take them.
+        image = pixels.movedim(0, -1) if pixels.shape[0] == 3 else pixels
+        self._stream.log(PICTURE, rr.Image(image.cpu().numpy()).compress(_JPEG_QUALITY))
+
     def _log_scene(self, snapshot: FlowSnapshot, heading: str) -> None:
-        scene = Scene(self._setting, snapshot, self._detail, self._grid)
+        scene = Scene(self.setting, snapshot, self._detail, self._grid)
         if self._map is not None:
             self._map.log(scene)
         for painter in self._stages:

@@ -14,6 +14,7 @@ from cnfp_torchrl.visual.colors import GOAL, rgb
 from cnfp_torchrl.visual.setting import Setting, StageView, pair_name
 
 TIMELINE = "env_step"
+PICTURE = "picture"
 MAP = "map"
 LEGEND = "legend"
 EXPLANATION = "explanation"
@@ -51,6 +52,17 @@ BAD_DOT = -2.0
 KNOT = -3.0
 MARK = -5.5
 MARK_INSIDE = -3.5
+
+
+def episode_timeline(number: int) -> str:
+    """Return the timeline of an episode, on which its steps are counted from 0."""
+    return f"episode_{number}"
+
+
+def series_path(plot: str, curve: str | None = None) -> str:
+    """Return the path of a plot's entity, or of that of one of its curves."""
+    parts = [SERIES, *plot.split("/"), *([] if curve is None else [curve])]
+    return rr.new_entity_path(parts).strip("/")
 
 
 def stage_path(setting: Setting, view: StageView) -> str:

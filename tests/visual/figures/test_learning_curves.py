@@ -125,3 +125,13 @@ def test_how_constraints_gave_way_is_one_panel_each_where_they_did() -> None:
         "wall: 0.25",
         "power: 0",
     }
+
+
+def test_the_evaluations_stand_beside_the_training() -> None:
+    steps, values = np.array([10.0, 20.0]), np.array([1.0, 2.0])
+    curves = {"train/return": (steps, values), "evaluation/return": (steps, values + 1)}
+    axes = learning_curves(curves).axes[0]
+    assert [line.get_label() for line in axes.lines] == ["training", "evaluation"]
+    legend = axes.get_legend()
+    assert legend is not None
+    assert len(legend.get_texts()) == 2

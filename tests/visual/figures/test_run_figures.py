@@ -50,7 +50,7 @@ def configure(*overrides: str) -> DictConfig:
 
 def pendulum() -> DictConfig:
     """A configuration with another environment: one action, no constraints, no map."""
-    config = configure()
+    config = configure("flow=unconstrained")
     OmegaConf.set_struct(config, value=False)
     config.env = {
         "agents": 1,

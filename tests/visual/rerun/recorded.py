@@ -22,7 +22,12 @@ RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 
 def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
     """Write a recording to a file and close it."""
-    stream = rr.RecordingStream("tests", recording_id="tests", send_properties=False)
+    # In portions of a given size: by the clock, a busy machine would cut elsewhere.
+    portions = rr.ChunkBatcherConfig.NEVER()
+    portions.flush_num_bytes = 1 << 16
+    stream = rr.RecordingStream(
+        "tests", recording_id="tests", send_properties=False, batcher_config=portions
+    )
     stream.save(path)
     write(stream)
     stream.flush(timeout_sec=10)
@@ -59,8 +64,10 @@ def record_steps(
     return taken
 
 
-def read(path: Path, entity: str, component: str) -> dict[int, NDArray[np.float64]]:
-    """Return a component of an entity by step, each as an array; -1 for what is static.
+def read(
+    path: Path, entity: str, component: str, timeline: str = "env_step"
+) -> dict[int, NDArray[np.float64]]:
+    """Return a component of an entity by a timeline's step, as arrays; -1 for what is static.
 
     Lines of different lengths become an array of arrays.
     """
@@ -70,8 +77,10 @@ def read(path: Path, entity: str, component: str) -> dict[int, NDArray[np.float6
         if component not in batch.schema.names:
             continue
         values = batch.column(component).to_pylist()
-        static = "env_step" not in batch.schema.names
-        steps = [-1] * len(values) if static else batch.column("env_step").to_pylist()
+        timelines = [n for n in batch.schema.names if n == "env_step" or n.startswith("episode_")]
+        if timelines and timeline not in timelines:
+            continue
+        steps = batch.column(timeline).to_pylist() if timelines else [-1] * len(values)
         for step, value in zip(steps, values, strict=True):
             found[step] = np.array(value, dtype=object if _is_ragged(value) else None)
     return found

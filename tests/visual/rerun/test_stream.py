@@ -15,7 +15,8 @@ from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
-from cnfp_torchrl.visual.rerun import FlowStream
+from cnfp_torchrl.visual.rerun import FlowStream, open_recording
+from cnfp_torchrl.visual.setting import Setting
 from tests.visual.cases import (
     CONFLICT,
     LINE,
@@ -26,6 +27,7 @@ from tests.visual.cases import (
     Gaussian,
     first,
     make_actor,
+    make_snapshot,
     make_state,
 )
 from tests.visual.rerun.recorded import compare, read, record, record_steps
@@ -124,7 +126,7 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
     returns = torch.cat([reward[:3].cumsum(0), reward[3:6].cumsum(0), reward[6:]])
     logged = read(path, "/series/return", "Scalars:scalars")
     np.testing.assert_allclose([logged[10 * step].item() for step in range(7)], returns.numpy())
-    charge = read(path, "/series/battery", "Scalars:scalars")
+    charge = read(path, "/series/task/battery", "Scalars:scalars")
     np.testing.assert_allclose(charge[20], [100 * rollout["observation"][2, 2].item(), 20])
     assert read(path, "/series/costs", "Scalars:scalars")[60].tolist() == [0, 0]
     place = rollout["observation"][:, :2].double().numpy()
@@ -287,11 +289,49 @@ def test_another_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_only_what_is_used_is_imported() -> None:
+    # Where Ray is installed TorchRL imports it, and with it psutil and pyarrow.
     code = (
-        "import sys, cnfp_torchrl.visual\n"
-        "assert not {'rerun', 'matplotlib', 'hydra', 'psutil', 'pyarrow'} & set(sys.modules)\n"
+        "import sys, torchrl.collectors, torchrl.envs\n"
+        "before = set(sys.modules)\n"
+        "import cnfp_torchrl.visual\n"
+        "new = set(sys.modules) - before\n"
+        "assert not {'rerun', 'matplotlib', 'hydra', 'psutil', 'pyarrow'} & new\n"
         "import cnfp_torchrl.visual.rerun\n"
         "assert 'rerun' in sys.modules\n"
         "assert not {'matplotlib', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_what_the_constraints_did_stands_beside_the_reward(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    (step,) = record_steps(path, SPACE, dim=3, steps=1)
+    allowed, action = (
+        read(path, f"/series/{name}", "Scalars:scalars")[0] for name in ("allowed", "action")
+    )
+    for constraint in SPACE:
+        assert read(path, f"/series/moved/{constraint}", "Scalars:scalars")[0] >= 0
+        assert read(path, f"/series/relaxation/{constraint}", "Scalars:scalars")[0] == 0
+    assert 0 <= allowed[0] <= 100
+    np.testing.assert_allclose(action, step["action"].numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("dim", "pairs"), [(3, 2), (4, 2), (5, 3), (6, 3)])
+def test_every_component_is_shown_unless_projections_are_chosen(dim: int, pairs: int) -> None:
+    shown = Setting.of(make_snapshot({}, dim=dim).head).projections
+    assert len(shown) == pairs
+    assert {component for pair in shown for component in pair} == set(range(dim))
+
+
+def test_a_picture_is_streamed_where_a_step_has_one(tmp_path: Path) -> None:
+    env = constrain_env(PointNavEnv([]), BatteryGeometry(), ObstacleGeometry())
+    actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
+    with open_recording(tmp_path / "recording.rrd") as recording:
+        stream = FlowStream(recording, actor, env, samples=16, timeline="episode_0")
+        for step, transition in enumerate(env.rollout(3, actor)):
+            if step != 1:
+                transition["pixels"] = torch.full((4, 6, 3), 99, dtype=torch.uint8)
+            stream.log_step(step, transition)
+    pictures = read(recording.path, "/picture", "EncodedImage:blob", "episode_0")
+    assert sorted(pictures) == [0, 2]
+    assert not read(recording.path, "/series/reward", "Scalars:scalars").keys() - {-1}

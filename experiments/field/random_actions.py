@@ -1,0 +1,133 @@
+"""Act at random in all of the field's tasks, with hostile latents, and count; keep the result.
+
+    python -m experiments.field.random_actions [--steps 50000] [--agents 50] [--seed 0]
+
+The exact flow maps latents of a random direction and of magnitudes from 1e-2 to 1e6, log-uniform,
+to float32 actions. The judges read the simulator's own state, in float64, with zero tolerance.
+Coverage is told of actions drawn uniformly from the action bounds and then moved towards the
+anchor by a random share: how many of those that the judges allow lie in the sets.
+The command fails if an allowed action was none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from cnfp_torchrl.keys import active_key
+from cnfp_torchrl.modules import flow_head
+from cnfp_torchrl.tasks.robots import RobotEnv
+from cnfp_torchrl.training.agent import build_actor, build_environment
+from cnfp_torchrl.whole_file import whole_file
+from experiments.field.jobs import ACTION_SIZES, DATA, Job
+from experiments.field.records import about
+
+RESULT = DATA / "random_actions.json"
+SMALLEST, LARGEST = -2.0, 6.0
+"""Decimal logarithms of the latents' magnitudes."""
+DRAWN, EVERY = 8, 20
+"""Actions drawn from the bounds for coverage in a state, and the steps between two such states."""
+
+
+@torch.no_grad()
+def act(task: str, *, steps: int, agents: int, seed: int) -> dict[str, Any]:
+    """Act in one task; return counts."""
+    started = time.perf_counter()
+    torch.manual_seed(seed)
+    config = Job(task, "hard", seed).config()
+    env = build_environment(config, batch_size=[agents])
+    env.set_seed(seed)
+    head = flow_head(build_actor(config, env))
+    robots = env.base_env
+    assert isinstance(robots, RobotEnv)
+    violations = torch.zeros(len(robots.judges))
+    relaxed = dict.fromkeys(head.order, 0)
+    allowed = covered = unsound = taken = 0
+    state = env.reset()
+    while taken < steps:
+        if taken // agents % EVERY == 0:
+            counts = coverage(robots, head, state)
+            allowed, covered, unsound = (
+                a + b for a, b in zip((allowed, covered, unsound), counts, strict=True)
+            )
+        direction = torch.nn.functional.normalize(torch.randn(agents, head.action_dim), dim=-1)
+        size = SMALLEST + (LARGEST - SMALLEST) * torch.rand(agents, 1)
+        state["action"] = head.get_bijector(state)(direction * 10**size)
+        for name in relaxed:
+            relaxed[name] += int((~state[active_key(name)]).sum())
+        transition, state = env.step_and_maybe_reset(state)
+        violations += transition["next", "cost"].sum(0)
+        taken += agents
+    return {
+        "task": task,
+        "steps": taken,
+        "violations": dict(zip(robots.judges, violations.long().tolist(), strict=True)),
+        "relaxed": {name: count / taken for name, count in relaxed.items()},
+        "drawn_and_allowed": allowed,
+        "coverage": covered / allowed,
+        "unsound": unsound,
+        "seconds": round(time.perf_counter() - started, 1),
+    }
+
+
+def coverage(robots: RobotEnv, head: Any, state: TensorDictBase) -> tuple[int, int, int]:
+    """Return how many of the drawn actions the judges allow, the sets too, and the sets alone."""
+    bounds, region = head.bounds, head.get_region(state)
+    shape = (DRAWN, len(robots.robots))
+    drawn = bounds.low + (bounds.high - bounds.low) * torch.rand(*shape, head.action_dim)
+    # Sets that are small beside the bounds are hit, too, on both sides of their boundaries.
+    drawn = torch.lerp(region.anchor, drawn, 10 ** -(1.5 * torch.rand(*shape, 1)))
+    inside = region.contains(drawn).numpy()
+    judged = np.array(
+        [
+            [
+                not any(
+                    judge(robot.unwrapped.model, robot.unwrapped.data, action)  # type: ignore[attr-defined]
+                    for judge in robots.judges.values()
+                )
+                for robot, action in zip(robots.robots, row, strict=True)
+            ]
+            for row in drawn.double().numpy()
+        ]
+    )
+    return int(judged.sum()), int((judged & inside).sum()), int((inside & ~judged).sum())
+
+
+def main() -> None:
+    """Act in all tasks, write the result, and judge."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--steps", type=int, default=50_000, help="of each task")
+    parser.add_argument("--agents", type=int, default=50, help="that act in parallel")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tasks", nargs="+", choices=list(ACTION_SIZES), default=ACTION_SIZES)
+    parser.add_argument("--output", type=Path, default=RESULT, help="the JSON file to write")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for task in given.tasks:
+        rows.append(act(task, steps=given.steps, agents=given.agents, seed=given.seed))
+        print(rows[-1], flush=True)
+    result = {
+        "command": f"python -m experiments.field.random_actions {' '.join(sys.argv[1:])}".rstrip(),
+        "about": about("cpu"),
+        "rows": rows,
+    }
+    given.output.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(given.output) as file:
+        file.write(f"{json.dumps(result, indent=1)}\n".encode())
+    if bad := [row for row in rows if any(row["violations"].values()) or row["unsound"]]:
+        sys.exit(f"violations, of which there should be none: {bad}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""Draw the kept records of training, and write what they say into the page.
+
+    python -m experiments.field.report [--data FOLDER] [--page FILE]
+
+Changes ``images/training.png`` beside the page, and what stands in the page between its two marks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments.field.jobs import DATA, FOLDER, METHODS, TRAINED
+from experiments.field.records import Record, read_records
+
+PAGE = FOLDER / "README.md"
+BEGIN, END = "<!-- results: by report.py -->", "<!-- end of results -->"
+BINS = 20
+"""Points of a curve."""
+EPISODE = 1000
+"""Steps of an episode that does not end early."""
+
+
+class Label(NamedTuple):
+    """How a method is called and drawn."""
+
+    text: str
+    color: str
+
+
+LABELS = {
+    "hard": Label("exact flow, hard retraction", "#0072B2"),
+    "soft": Label("exact flow, soft retraction", "#D55E00"),
+    "projection": Label("projection in the policy", "#009E73"),
+    "sb3_projection": Label("Stable-Baselines3, projection in the environment", "#CC79A7"),
+    "unconstrained": Label("unconstrained", "#5A5A5A"),
+}
+TITLES = {
+    "half_cheetah_power": "HalfCheetah, limited power",
+    "half_cheetah_rate": "HalfCheetah, limited rate",
+    "hopper_mixed": "Hopper, limits of power and effort",
+}
+
+
+def curve(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps and returns of training's policy.
+
+    Where episodes never end early, rewards times the length of an episode; else the mean return of
+    the episodes that ended between two points.
+    """
+    edges = np.linspace(0, record.steps, BINS + 1)
+    ends, returns = np.array(record.episode_steps), np.array(record.episode_returns)
+    if record.steps > 0.9 * EPISODE * len(ends):
+        ends, returns = np.array(record.reward_steps), np.array(record.rewards) * EPISODE
+    places = np.clip(np.digitize(ends, edges[1:], right=True), 0, BINS - 1)
+    kept = [index for index in range(BINS) if (places == index).any()]
+    return edges[1:][kept], np.array([returns[places == index].mean() for index in kept])
+
+
+def draw(records: Sequence[Record], path: Path) -> None:
+    """Draw a panel for each task: medians over seeds, and bands from the least to the most."""
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels: Sequence[Axes] = figure.subplots(1, len(TRAINED))
+    for axes, task in zip(panels, TRAINED, strict=True):
+        for method, label in LABELS.items():
+            chosen = [each for each in records if (each.task, each.method) == (task, method)]
+            if not chosen:
+                continue
+            curves = [curve(each) for each in chosen]
+            common = sorted(set.intersection(*(set(steps) for steps, _ in curves)))
+            values = np.array([np.interp(common, *each) for each in curves])
+            style = "--" if method == "unconstrained" else "-"
+            axes.plot(common, np.median(values, 0), style, color=label.color, label=label.text)
+            axes.fill_between(
+                common, values.min(0), values.max(0), color=label.color, alpha=0.15, linewidth=0
+            )
+        axes.set_title(TITLES[task], fontsize=10)
+        axes.set_xlabel("environment steps")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.ticklabel_format(style="sci", scilimits=(0, 4))
+    panels[0].set_ylabel("return of the policy in training")
+    shown = {
+        text: handle
+        for axes in panels
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        shown.values(), shown.keys(), loc="outside lower center", ncols=3, frameon=False, fontsize=9
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return the median, and the least and most where they differ."""
+    text = f"{median(values):,.0f}"
+    return text if len(values) == 1 else f"{text} [{min(values):,.0f}, {max(values):,.0f}]"
+
+
+def training_table(records: Sequence[Record], task: str) -> list[str]:
+    """Return a task's table."""
+    lines = [
+        f"### {TITLES[task]}",
+        "",
+        "| method | greedy return | stochastic return | violations | relaxed | moved "
+        "| ms an action | steps/s | points projected |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for method in LABELS:
+        chosen = [each for each in records if (each.task, each.method) == (task, method)]
+        if not chosen:
+            continue
+        greedy, stochastic = (
+            spread([float(np.mean(getattr(each, kind).returns)) for each in chosen])
+            for kind in ("greedy", "stochastic")
+        )
+        relaxed = max(max(each.relaxed.values(), default=0.0) for each in chosen)
+        moved = median(each.stochastic.moved for each in chosen)
+        cells = [
+            LABELS[method].text,
+            greedy,
+            stochastic,
+            f"{max(each.all_violations for each in chosen):,}",
+            f"{relaxed:.1%}",
+            f"{moved:.0%}",
+            f"{median(each.milliseconds for each in chosen):.2f}",
+            f"{median(each.steps_per_second for each in chosen):.0f}",
+            f"{median(each.projections for each in chosen):,.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def random_table(result: dict[str, Any]) -> list[str]:
+    """Return the table of random actions."""
+    lines = [
+        "## Random actions",
+        "",
+        "The exact flow on latents of magnitudes from 0.01 to 1e6, float32 actions, judged on the "
+        "simulator's own state with zero tolerance. Coverage: the share of what the judges allow "
+        "that lies in the sets.",
+        "",
+        "| task | steps | violations | relaxed | coverage | actions drawn for it |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in result["rows"]:
+        cells = [
+            f"`{row['task']}`",
+            f"{row['steps']:,}",
+            f"{sum(row['violations'].values())}",
+            f"{max(row['relaxed'].values()):.1%}",
+            f"{row['coverage']:.2%}",
+            f"{row['drawn_and_allowed']:,}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    about = result["about"]
+    return [*lines, "", f"`{result['command']}`; torch {about['torch']}, {about['machine']}.", ""]
+
+
+def results(data: Path, page: Path) -> str:
+    """Return what stands between the marks, and draw the figure it shows."""
+    lines: list[str] = []
+    if records := read_records(data):
+        draw(records, page.parent / "images" / "training.png")
+        steps, about = {each.steps for each in records}, records[0].about
+        devices = sorted({f"{each.about['machine']}, {each.about['device']}" for each in records})
+        lines += [
+            "## Training",
+            "",
+            "![Returns over training](images/training.png)",
+            "",
+            f"{max(steps):,} steps of SAC, 8 robots together, width 256, batch 256, half an update "
+            "a step, the same of all methods; medians over "
+            f"{len({each.seed for each in records})} seeds [least, most] of 8 episodes; violations "
+            "of the worst run, training and both evaluations together; one seed of unconstrained. "
+            "Moved: the share of drawn actions that the constraints changed by more than 0.001. "
+            "Milliseconds are those of one state, from its observation to the action, on a busy "
+            "machine; steps a second those of training, other runs beside it.",
+            "",
+            *(line for task in TRAINED for line in training_table(records, task)),
+            f"torch {about['torch']}, TorchRL {about['torchrl']}, MuJoCo {about['mujoco']}; "
+            f"{'; '.join(devices)}; one thread a run.",
+            "",
+        ]
+    if (path := data / "random_actions.json").exists():
+        lines += random_table(json.loads(path.read_text()))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the records")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the page to change")
+    given = parser.parse_args()
+    before, _, rest = given.page.read_text().partition(BEGIN)
+    _, mark, after = rest.partition(END)
+    if not mark:
+        raise SystemExit(f"{given.page}: expected the marks {BEGIN!r} and {END!r}")
+    text = f"{before}{BEGIN}\n\n{results(given.data, given.page)}\n{END}{after}"
+    given.page.write_text(text)
+
+
+assert set(LABELS) == set(METHODS)
+
+if __name__ == "__main__":
+    main()
