@@ -15,6 +15,7 @@ import json
 import math
 import platform
 import random
+import re
 import resource
 import shutil
 import subprocess
@@ -74,7 +75,9 @@ def _content(path: Path) -> dict[str, Any]:
 def _events(path: Path) -> dict[str, list[tuple[int, float]]]:
     """Return the points in TensorBoard's files, in the order in which they were written."""
     points: dict[str, list[tuple[int, float]]] = {}
-    for file in sorted(path.glob("events.*")):
+    # Their names end with time, process and number.
+    numbered = [([int(n) for n in re.findall(r"\d+", f.name)], f) for f in path.glob("events.*")]
+    for _, file in sorted(numbered):
         reader = EventAccumulator(str(file), purge_orphaned_data=False).Reload()
         for name in reader.Tags()["scalars"]:
             if name not in OF_THE_CLOCK:

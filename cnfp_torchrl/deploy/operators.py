@@ -44,6 +44,14 @@ def _fmin(first: Tensor, second: Tensor) -> Tensor:
     return torch.where(first.isnan() | (second < first), second, first)
 
 
+def _hypot(first: Tensor, second: Tensor) -> Tensor:
+    """Return lengths whose squares may be out of range."""
+    size = torch.maximum(first.abs(), second.abs())
+    unit = torch.where((size > 0) & size.isfinite(), size, 1.0)
+    length = unit * ((first / unit).square() + (second / unit).square()).sqrt()
+    return torch.where(size.isfinite(), length, size)
+
+
 def _frexp(value: Tensor) -> tuple[Tensor, Tensor]:
     """Split numbers into mantissas in [0.5, 1) and powers of two, exactly."""
     size = value.abs()
@@ -107,6 +115,7 @@ def _solve_ex(
 _REPLACEMENTS: dict[Any, Callable[..., Any]] = {
     torch.where: _where,
     torch.fmin: _fmin,
+    torch.hypot: _hypot,
     torch.frexp: _frexp,
     torch.linalg.solve_triangular: _solve_triangular,
     torch.linalg.solve_ex: _solve_ex,

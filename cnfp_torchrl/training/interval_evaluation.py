@@ -54,7 +54,8 @@ class IntervalEvaluation:
         """
         interval = self._settings.interval
         before = self.history[-1]["step"] if self.history else 0
-        if interval is None or not (is_last or frames // interval > before // interval):
+        is_due = interval is not None and frames // interval > before // interval
+        if interval is None or not (is_due or (is_last and frames > before)):
             return None
         with torch.random.fork_rng():
             if self._env is None:

@@ -175,7 +175,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     metrics.add_losses(losses)
                 metrics.log_if_due()
                 is_last = metrics.frames >= config.collector.total_frames
-                if (report := evaluations.run_if_due(metrics.frames, is_last)) is not None:
+                if (report := evaluations.run_if_due(metrics.frames, is_last=False)) is not None:
                     metrics.add_evaluation(report)
                     best.offer_evaluation(report)
                 if is_last or stop.signal is not None or state.is_due(metrics.frames):
@@ -184,6 +184,10 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                     state.save(metrics.frames)
                 if stop.signal is not None:
                     raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
+            # Behind the last state, so that an extended run is as one that was longer at once.
+            if (report := evaluations.run_if_due(metrics.frames, is_last=True)) is not None:
+                metrics.add_evaluation(report)
+                best.offer_evaluation(report)
             metrics.finish()
         # Before anything else that may fail or be interrupted.
         folder.save_checkpoint(**trained)

@@ -31,6 +31,16 @@ def test_fmin_takes_the_number() -> None:
     assert torch.equal(found.nan_to_num(9), torch.fmin(first, second).nan_to_num(9))
 
 
+def test_hypot_neither_overflows_nor_underflows() -> None:
+    torch.manual_seed(0)
+    sizes = 10.0 ** torch.arange(-30, 31)
+    first, second = torch.randn(2, 61) * sizes
+    first, second = (torch.cat([each, torch.tensor([0.0, torch.inf])]) for each in (first, second))
+    with OperatorsOfOnnx():
+        found = torch.hypot(first, second)
+    torch.testing.assert_close(found, torch.hypot(first, second), rtol=1e-6, atol=0)
+
+
 def test_where_among_flags_and_among_numbers() -> None:
     condition, chosen, other = torch.tensor([[1, 0, 1, 0], [1, 1, 0, 0], [0, 1, 1, 0]]).bool()
     expected = torch.where(condition, chosen, other)
