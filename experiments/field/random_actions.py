@@ -1,6 +1,6 @@
 """Act at random in all of the field's tasks, with hostile latents, and count; keep the result.
 
-    python -m experiments.field.random_actions [--steps 50000] [--agents 50] [--seed 0]
+    python -m experiments.field.random_actions [--steps 50000] [--agents 250] [--seed 0]
 
 The exact flow maps latents of a random direction and of magnitudes from 1e-2 to 1e6, log-uniform,
 to float32 actions. The judges read the simulator's own state, in float64, with zero tolerance.
@@ -107,7 +107,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--steps", type=int, default=50_000, help="of each task")
-    parser.add_argument("--agents", type=int, default=50, help="that act in parallel")
+    parser.add_argument("--agents", type=int, default=250, help="that act in parallel")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tasks", nargs="+", choices=list(ACTION_SIZES), default=ACTION_SIZES)
     parser.add_argument("--output", type=Path, default=RESULT, help="the JSON file to write")

@@ -112,9 +112,9 @@ def training_table(records: Sequence[Record], task: str) -> list[str]:
     lines = [
         f"### {TITLES[task]}",
         "",
-        "| method | greedy return | stochastic return | violations | relaxed | moved "
+        "| method | seeds | greedy return | stochastic return | violations | relaxed | moved "
         "| ms an action | steps/s | points projected |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method in LABELS:
         chosen = [each for each in records if (each.task, each.method) == (task, method)]
@@ -128,6 +128,7 @@ def training_table(records: Sequence[Record], task: str) -> list[str]:
         moved = median(each.stochastic.moved for each in chosen)
         cells = [
             LABELS[method].text,
+            str(len(chosen)),
             greedy,
             stochastic,
             f"{max(each.all_violations for each in chosen):,}",
@@ -180,8 +181,8 @@ def results(data: Path, page: Path) -> str:
             "![Returns over training](images/training.png)",
             "",
             f"{max(steps):,} steps of SAC, 8 robots together, width 256, batch 256, half an update "
-            "a step, the same of all methods; medians over "
-            f"{len({each.seed for each in records})} seeds [least, most] of 8 episodes; violations "
+            "a step, the same of all methods; medians over the seeds that have a record [least, "
+            "most], each the mean of 8 episodes; violations "
             "of the worst run, training and both evaluations together; one seed of unconstrained. "
             "Moved: the share of drawn actions that the constraints changed by more than 0.001. "
             "Milliseconds are those of one state, from its observation to the action, on a busy "
