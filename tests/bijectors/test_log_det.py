@@ -50,7 +50,7 @@ def test_forward_and_log_det_match_mpmath(case: Case, length: float) -> None:
 
 
 def seam(case: Case) -> float:
-    """Return by how much erosion moves the boundary: the rounding of sets larger than the bounds."""
+    """Return how far erosion moves the boundary, by the rounding of sets larger than bounds."""
     if case.anchor is None:
         return 0.0
     region = case.region(torch.float64)
