@@ -141,6 +141,11 @@ class RunFolder:
         """
         folder = cls(path, checkpoint)
         missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
+        if missing == [BEST]:
+            raise FileNotFoundError(
+                f"checkpoint: expected {BEST} in {folder.path}, which has none, for no policy was "
+                f"scored in training without a violation; take the last one, {CHECKPOINT}"
+            )
         if missing:
             raise FileNotFoundError(
                 f"run: expected the folder of a finished run with {CONFIG} and {checkpoint}, but "
