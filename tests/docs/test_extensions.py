@@ -11,15 +11,13 @@ import pytest
 from docutils import nodes
 
 import cnfp_torchrl
-from tests.torchrl_store import registered
 
 EXTENSIONS = Path(__file__).resolve().parents[2] / "docs" / "extensions"
 
 
 @pytest.fixture
 def extension(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """Return how to import an extension by its name; some import the whole package."""
-    registered()
+    """Return how to import an extension by its name."""
     monkeypatch.syspath_prepend(EXTENSIONS)
     yield importlib.import_module
     for name in [path.stem for path in EXTENSIONS.glob("*.py")]:
