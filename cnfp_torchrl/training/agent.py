@@ -49,6 +49,10 @@ def build_environment(
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
+
+    Raises:
+        ValueError: when a geometry is null or has another name than its key, and when there is none
+            for a flow that guarantees constraints.
     """
     replaced: dict[str, Any] = {}
     if batch_size is not None and "batch_size" in config.env.base:
@@ -68,9 +72,15 @@ def build_environment(
     if penalty is not None:  # behind the sum, which is of the reward without it
         env.append_transform(penalty)
     geometries = _geometries(config)
-    if not geometries:
-        return env
     flow: Flow = instantiate(config.flow)
+    if not geometries:
+        if flow.is_safe:
+            env.close()
+            raise ValueError(
+                f"env.geometry: expected at least one constraint for {type(flow).__name__} to keep "
+                "to, given none; name its set there, or train with flow=unconstrained"
+            )
+        return env
     order = config.env.get("order")
     return constrain_env(
         env,
@@ -83,7 +93,12 @@ def build_environment(
 def _geometries(config: DictConfig) -> list[GeometryTransform]:
     """Return the transforms that publish the constraints, in the order of the configuration."""
     geometries = []
-    for name, section in config.env.get("geometry", {}).items():
+    for name, section in (config.env.get("geometry") or {}).items():
+        if section is None:
+            raise ValueError(
+                f"env.geometry.{name}: expected a _target_, given null; leave a constraint out by "
+                f"~env.geometry.{name}"
+            )
         geometry = instantiate(section, _convert_="all")
         if geometry.name != name:
             raise ValueError(

@@ -134,6 +134,11 @@ def test_no_logger_is_fine(tiny_run: Run) -> None:
         ("env.base.collision=bounce", "bounce"),
         ("env.layout.stations=[]", "stations"),
         ("env.geometry.battery.name=charge", "env.geometry.battery.name: expected 'battery'"),
+        ("env.geometry.battery=null", "env.geometry.battery: expected a _target_, given null"),
+        (
+            "env.geometry=null env.order=[]",
+            "env.geometry: expected at least one constraint for E",
+        ),
     ],
 )
 def test_bad_configuration_is_refused_before_anything_runs(
@@ -149,7 +154,7 @@ def test_bad_configuration_is_refused_before_anything_runs(
     monkeypatch.setattr(PointNavEnv, "_step", no_step)
     folder = RunFolder.create(tmp_path / "run")
     with pytest.raises(Exception, match=message):
-        train(make_config(override), folder)
+        train(make_config(*override.split()), folder)
     assert not list(folder.path.iterdir())
 
 
