@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.torchrl_store import registered
+
 
 def pytest_configure() -> None:
+    # Whatever imports TorchRL's groups later finds them imported, and Hydra's store as it was.
+    registered()
     # pytest-xdist starts one worker per core; more threads than that only wait for each other.
     torch.set_num_threads(1)
 

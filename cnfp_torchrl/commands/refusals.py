@@ -11,6 +11,7 @@ from difflib import get_close_matches
 
 from hydra.errors import CompactHydraException, InstantiationException
 from omegaconf import MissingMandatoryValue
+from omegaconf.errors import InterpolationResolutionError
 
 
 @contextmanager
@@ -18,8 +19,9 @@ def told_in_a_sentence() -> Iterator[None]:
     """Let Hydra print this package's refusals without a traceback, unless HYDRA_FULL_ERROR is set.
 
     A refusal is a `ValueError`, `TypeError` or `OSError` that a raise statement of this package
-    raised, or a target that cannot be built, of which Hydra hides the cause. All other errors keep
-    their traceback: nobody foresaw them, so that the place matters.
+    raised, a target that cannot be built, of which Hydra hides the cause, or a value that is taken
+    from a setting that is not there. All other errors keep their traceback: nobody foresaw them, so
+    that the place matters.
 
     Raises:
         CompactHydraException: in place of a refusal, with its words.
@@ -30,6 +32,12 @@ def told_in_a_sentence() -> Iterator[None]:
     except MissingMandatoryValue as error:
         key = error.full_key
         raise CompactHydraException(f"{key}: expected a value, given none; add {key}=...") from None
+    except InterpolationResolutionError as error:
+        first = str(error).partition("\n")[0]
+        raise CompactHydraException(
+            f"{error.full_key}: its value is taken from a setting that is not there: {first}; give "
+            f"{error.full_key}=..., or the setting"
+        ) from None
     except InstantiationException as error:
         raise CompactHydraException(_why_not_built(error)) from error
     except (ValueError, TypeError, OSError) as error:

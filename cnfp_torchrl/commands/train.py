@@ -130,7 +130,8 @@ def _main(config: DictConfig) -> float:
             sys.stderr.write(f"{stop}\n")
             sys.exit(128 + stop.number)
         except Exception as error:
-            if is_sweep or folder.has_started:
+            # A complete run has not failed because it was asked to go on.
+            if (is_sweep or folder.has_started) and not folder.is_complete:
                 folder.save_failure(error)
             raise
         finally:

@@ -120,6 +120,14 @@ class RunFolder:
         """Tell whether training has ended and written its summary."""
         return (self.path / SUMMARY).is_file()
 
+    @property
+    def is_complete(self) -> bool:
+        """Tell whether the run is finished with all steps that its configuration asks for."""
+        if not self.is_finished:
+            return False
+        wanted: int = self.load_settings()["collector"]["total_frames"]
+        return bool(self.load_summary()["steps"] >= wanted)
+
     @classmethod
     def open(cls, path: str | Path, checkpoint: str = CHECKPOINT) -> RunFolder:
         """Return the folder of a finished run.
@@ -133,6 +141,11 @@ class RunFolder:
         """
         folder = cls(path, checkpoint)
         missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
+        if missing == [BEST]:
+            raise FileNotFoundError(
+                f"checkpoint: expected {BEST} in {folder.path}, which has none, for no policy was "
+                f"scored in training without a violation; take the last one, {CHECKPOINT}"
+            )
         if missing:
             raise FileNotFoundError(
                 f"run: expected the folder of a finished run with {CONFIG} and {checkpoint}, but "
@@ -300,6 +313,10 @@ class RunFolder:
     def forget_failure(self) -> None:
         """Remove what `save_failure` wrote, for a run that is tried again."""
         (self.path / FAILURE).unlink(missing_ok=True)
+
+    def load_summary(self) -> dict[str, Any]:
+        """Read the summary."""
+        return dict(json.loads((self.path / SUMMARY).read_text(encoding="utf-8")))
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write the summary."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ import yaml
 from scipy import stats
 
 from cnfp_torchrl.training.checkpoints import Checkpoints
-from cnfp_torchrl.training.run_folder import CONFIG, STATES, SUMMARY, RunFolder
+from cnfp_torchrl.training.run_folder import CONFIG, STATES, RunFolder
 
 OVERRIDES = Path(".hydra") / "overrides.yaml"
 """The file in a run's folder that says what was asked for."""
@@ -139,11 +138,8 @@ def _read_run(path: Path) -> SweepRun:
             overrides[key.lstrip("+~")] = value
     if folder.is_held:
         return SweepRun(path, overrides, "running")
-    if folder.is_finished:
-        summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-        wanted = folder.load_settings()["collector"]["total_frames"]
-        if summary["steps"] >= wanted:
-            return SweepRun(path, overrides, "done", summary=summary)
+    if folder.is_complete:
+        return SweepRun(path, overrides, "done", summary=folder.load_summary())
     if (reason := folder.load_failure()) is not None:
         return SweepRun(path, overrides, "failed", reason)
     steps = Checkpoints(path / STATES, keep=1).frames()

@@ -2,8 +2,9 @@
 
     python experiments/examples/sac_made_safe.py [--steps 8000] [--unsafe]
 
-`make_actor` and `train` are what anybody would write who knows TorchRL and has never heard of
-constraints. Violations are counted by the environment, on every executed action of the training.
+Without the lines marked `# safe` it is what anybody would write who knows TorchRL and has never
+heard of constraints. Violations are counted by the environment, on every executed action of the
+training.
 """
 
 import argparse
@@ -23,8 +24,8 @@ from torchrl.modules import (
 )
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cnfp_torchrl import constrain, constrain_env
-from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl import constrain, constrain_env  # safe
+from cnfp_torchrl.tasks import point_nav
 
 
 def main() -> None:
@@ -33,18 +34,19 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000, help="environment steps")
     parser.add_argument("--agents", type=int, default=16, help="that act in parallel")
     parser.add_argument("--updates", type=int, default=32, help="for each 8 steps of all agents")
-    parser.add_argument("--unsafe", action="store_true", help="leave the constraints out")
+    parser.add_argument("--unsafe", action="store_true", help="leave constraints out")  # safe
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.manual_seed(arguments.seed)
 
-    env: EnvBase = PointNavEnv([arguments.agents], seed=arguments.seed)
+    env: EnvBase = point_nav.PointNavEnv([arguments.agents], seed=arguments.seed)
     actor = make_actor(env)
-    if not arguments.unsafe:
-        # The environment publishes what each state allows, the last constraint first; the actor
-        # heeds it.
-        env = constrain_env(env, BatteryGeometry(), ObstacleGeometry())
-        actor = constrain(actor, env)
+    if not arguments.unsafe:  # safe
+        # The environment publishes what each state allows (the last constraint is the most
+        # important), and the actor heeds it.
+        geometries = point_nav.BatteryGeometry(), point_nav.ObstacleGeometry()  # safe
+        env = constrain_env(env, *geometries)  # safe
+        actor = constrain(actor, env)  # safe
 
     steps = train(env, actor, steps=arguments.steps, updates=arguments.updates)
     reward, last = steps["next", "reward"], -len(steps) // 4

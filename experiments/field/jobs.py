@@ -12,6 +12,8 @@ from cnfp_torchrl.configuration import config_directory
 
 FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
+RANDOM_ACTIONS = "random_actions"
+"""The folder in `DATA` of what random actions did, a file for each task."""
 
 ACTION_SIZES = {
     "half_cheetah_power": 6,

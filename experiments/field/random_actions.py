@@ -1,6 +1,10 @@
 """Act at random in all of the field's tasks, with hostile latents, and count; keep the result.
 
     python -m experiments.field.random_actions [--steps 50000] [--agents 250] [--seed 0]
+        [--tasks ...] [--data FOLDER]
+
+A file for each task is written as soon as the task is done. What has its file already is not done
+again, so the same command goes on where it was stopped.
 
 The exact flow maps latents of a random direction and of magnitudes from 1e-2 to 1e6, log-uniform,
 to float32 actions. The judges read the simulator's own state, in float64, with zero tolerance.
@@ -15,6 +19,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +31,57 @@ from cnfp_torchrl.keys import active_key
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.tasks.robots import RobotEnv
 from cnfp_torchrl.training.agent import build_actor, build_environment
-from cnfp_torchrl.whole_file import whole_file
-from experiments.field.jobs import ACTION_SIZES, DATA, Job
-from experiments.field.records import about
+from cnfp_torchrl.whole_file import write_json
+from experiments.field.jobs import ACTION_SIZES, DATA, RANDOM_ACTIONS, Job
+from experiments.field.records import RecordError, about
 
-RESULT = DATA / "random_actions.json"
 SMALLEST, LARGEST = -2.0, 6.0
 """Decimal logarithms of the latents' magnitudes."""
 DRAWN, EVERY = 8, 20
 """Actions drawn from the bounds for coverage in a state, and the steps between two such states."""
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What a task is acted in with.
+
+    Args:
+        steps: The least number of steps, of all agents together.
+        agents: The number of agents that act in parallel.
+        seed: The seed of everything random.
+    """
+
+    steps: int
+    agents: int
+    seed: int
+
+
+def result_of(task: str, settings: Settings, data: Path) -> dict[str, Any]:
+    """Return the kept result of a task, or act in it and keep what comes out.
+
+    Raises:
+        RecordError: for a kept result of other settings.
+    """
+    path = data / RANDOM_ACTIONS / f"{task}.json"
+    if path.exists():
+        kept: dict[str, Any] = json.loads(path.read_bytes())
+        if kept["settings"] != asdict(settings):
+            raise RecordError(
+                f"{path}: expected a result of {asdict(settings)}, found one of "
+                f"{kept['settings']}; give those, or another folder with --data"
+            )
+        return kept
+    done = act(task, settings)
+    result = {"settings": asdict(settings), "about": about("cpu"), **done}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, result)
+    return result
+
+
 @torch.no_grad()
-def act(task: str, *, steps: int, agents: int, seed: int) -> dict[str, Any]:
+def act(task: str, settings: Settings) -> dict[str, Any]:
     """Act in one task; return counts."""
+    steps, agents, seed = settings.steps, settings.agents, settings.seed
     started = time.perf_counter()
     torch.manual_seed(seed)
     config = Job(task, "hard", seed).config()
@@ -110,22 +152,17 @@ def main() -> None:
     parser.add_argument("--agents", type=int, default=250, help="that act in parallel")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tasks", nargs="+", choices=list(ACTION_SIZES), default=ACTION_SIZES)
-    parser.add_argument("--output", type=Path, default=RESULT, help="the JSON file to write")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the records")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
+    settings = Settings(given.steps, given.agents, given.seed)
+    bad = []
     for task in given.tasks:
-        rows.append(act(task, steps=given.steps, agents=given.agents, seed=given.seed))
-        print(rows[-1], flush=True)
-    result = {
-        "command": f"python -m experiments.field.random_actions {' '.join(sys.argv[1:])}".rstrip(),
-        "about": about("cpu"),
-        "rows": rows,
-    }
-    given.output.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(given.output) as file:
-        file.write(f"{json.dumps(result, indent=1)}\n".encode())
-    if bad := [row for row in rows if any(row["violations"].values()) or row["unsound"]]:
+        row = result_of(task, settings, given.data)
+        print(row, flush=True)
+        if any(row["violations"].values()) or row["unsound"]:
+            bad.append(row)
+    if bad:
         sys.exit(f"violations, of which there should be none: {bad}")
 
 

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.field.jobs import DATA, FOLDER, METHODS, TRAINED
+from experiments.field.jobs import ACTION_SIZES, DATA, FOLDER, METHODS, RANDOM_ACTIONS, TRAINED
 from experiments.field.records import Record, read_records
 
 PAGE = FOLDER / "README.md"
@@ -142,7 +142,7 @@ def training_table(records: Sequence[Record], task: str) -> list[str]:
     return [*lines, ""]
 
 
-def random_table(result: dict[str, Any]) -> list[str]:
+def random_table(rows: list[dict[str, Any]]) -> list[str]:
     """Return the table of random actions."""
     lines = [
         "## Random actions",
@@ -154,7 +154,7 @@ def random_table(result: dict[str, Any]) -> list[str]:
         "| task | steps | violations | relaxed | coverage | actions drawn for it |",
         "|---|---|---|---|---|---|",
     ]
-    for row in result["rows"]:
+    for row in rows:
         cells = [
             f"`{row['task']}`",
             f"{row['steps']:,}",
@@ -164,8 +164,12 @@ def random_table(result: dict[str, Any]) -> list[str]:
             f"{row['drawn_and_allowed']:,}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    about = result["about"]
-    return [*lines, "", f"`{result['command']}`; torch {about['torch']}, {about['machine']}.", ""]
+    made_with = sorted({f"torch {r['about']['torch']}, {r['about']['machine']}" for r in rows})
+    commands = {" ".join(f"--{key} {value}" for key, value in r["settings"].items()) for r in rows}
+    made_by = "; ".join(
+        f"`python -m experiments.field.random_actions {c}`" for c in sorted(commands)
+    )
+    return [*lines, "", f"{made_by}; {'; '.join(made_with)}.", ""]
 
 
 def results(data: Path, page: Path) -> str:
@@ -193,8 +197,9 @@ def results(data: Path, page: Path) -> str:
             f"{'; '.join(devices)}; one thread a run.",
             "",
         ]
-    if (path := data / "random_actions.json").exists():
-        lines += random_table(json.loads(path.read_text()))
+    paths = [data / RANDOM_ACTIONS / f"{task}.json" for task in ACTION_SIZES]
+    if rows := [json.loads(path.read_text()) for path in paths if path.exists()]:
+        lines += random_table(rows)
     return "\n".join(lines)
 
 

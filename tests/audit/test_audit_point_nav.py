@@ -53,7 +53,8 @@ def test_the_shipped_geometry_passes(make_config: Callable[..., DictConfig]) -> 
     rows = [
         line for line in str(report).split("\n") if line.startswith(("states", *report.sources))
     ]
-    assert len(rows) == 3 * (1 + 2 * 3)
+    # Three tables for two sources and three names, then the flow's for each source.
+    assert len(rows) == 3 * (1 + 2 * 3) + 2
     assert max(map(len, rows)) <= 100
     # Uniform states lie in the rectangle, too, and with batteries below the threshold.
     assert found(report, "uniform", "obstacle", "relaxed")["count"] > 0

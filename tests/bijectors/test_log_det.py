@@ -45,8 +45,16 @@ def test_forward_and_log_det_match_mpmath(case: Case, length: float) -> None:
         error = max(
             abs(mpf(a) - b) for a, b in zip(action[0][index].tolist(), expected_action, strict=True)
         )
-        assert error <= 1e-12 * case.size
+        assert error <= 1e-12 * case.size + seam(case)
         assert abs(mpf(log_det[0][index].item()) - expected) <= close * (1 + abs(expected) * 1e-6)
+
+
+def seam(case: Case) -> float:
+    """Return how far erosion moves the boundary, by the rounding of sets larger than bounds."""
+    if case.anchor is None:
+        return 0.0
+    region = case.region(torch.float64)
+    return float((region.slack(region.anchor) - region.eroded().slack(region.anchor)).max())
 
 
 def some_indices(batch_shape: torch.Size) -> list[tuple[int, ...]]:

@@ -12,7 +12,12 @@ from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.bijectors import BoxSquash, NoDensityError, Projection
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
-from cnfp_torchrl.geometry import ConstraintSet, Region, project_onto_intersection
+from cnfp_torchrl.geometry import (
+    ConstraintSet,
+    Region,
+    VisibleRegion,
+    project_onto_intersection,
+)
 from tests.bijectors.cases import DTYPES, Case, Maker, latents
 
 Family = Callable[[Maker], ConstraintSet]
@@ -170,8 +175,11 @@ def test_rounds_are_checked(rounds: int) -> None:
         Projection(KINDS["box"].case().region(torch.float32), rounds=rounds)
 
 
-def test_other_families_are_refused() -> None:
+def test_sets_of_no_described_shape_are_refused() -> None:
     make = Maker(2, slack=0.05)
-    region = Region((make.bounds(), make.ellipsoid()), make.anchor)
-    with pytest.raises(TypeError, match=r"closed-form projection, one of .* given Ellipsoid"):
+    wall = torch.tensor([[[0.5, -1.0], [0.6, 1.0]]], dtype=torch.float64)
+    step = torch.ones((), dtype=torch.float64)
+    seen = VisibleRegion(torch.zeros(2, dtype=torch.float64), wall, step)
+    region = Region((make.bounds(), seen), make.anchor)
+    with pytest.raises(TypeError, match=r"a set with a projection, .* given VisibleRegion"):
         Projection(region, rounds=1)(torch.zeros(2, dtype=torch.float64))

@@ -21,8 +21,11 @@ from cnfp_torchrl.training.run_folder import RunFolder
         (lambda: in_order([object()], None), "ConstraintBijector"),  # type: ignore[list-item]
         (lambda: RunFolder.open("nowhere"), "nowhere"),
         (lambda: OmegaConf.create({"run": "???"}).run, "run=..."),
+        (lambda: OmegaConf.create({"a": "${gone}"}).a, r"^a: [^\n]*gone[^\n]*$"),
+        (lambda: OmegaConf.create({"a": {"b": "${oc.dict.keys:c.d}"}}).a.b, r"^a\.b: [^\n]*c\.d"),
+        (lambda: OmegaConf.create({"a": "${b}", "b": "???"}).a, "^a: "),
     ],
-    ids=["ValueError", "TypeError", "OSError", "missing"],
+    ids=["ValueError", "TypeError", "OSError", "missing", "gone", "section gone", "from missing"],
 )
 def test_a_refusal_becomes_a_sentence(refused: Callable[[], object], named: str) -> None:
     with pytest.raises(CompactHydraException, match=named), told_in_a_sentence():

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cnfp_torchrl.training.run_folder import RunFolder
+
 TINY = [
     "collector.total_frames=96",
     "training.warmup_frames=48",
@@ -50,6 +52,13 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert second["folder"] == "1_lr-0.001"
     assert str(sweep / "sweep.csv") in done.stdout
     assert first["state"] in done.stdout
+    # What refuses to go on with a complete run says nothing of it.
+    complete = sweep / second["folder"]
+    refused = run("train", f"resume={complete}", cwd=tmp_path)
+    assert refused.returncode == 1
+    assert "has finished with 96 steps" in refused.stderr
+    assert RunFolder(complete).load_failure() is None
+    assert RunFolder(sweep / first["folder"]).load_failure() is not None
 
 
 @pytest.mark.slow

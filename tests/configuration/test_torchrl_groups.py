@@ -1,9 +1,6 @@
 """Our parts in TorchRL's groups of configurations, and its own trainer that trains with them."""
 
-from copy import deepcopy
 from dataclasses import fields
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,7 +9,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.core.plugins import Plugins
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
@@ -20,6 +16,7 @@ from tensordict import TensorDict
 from cnfp_torchrl.envs import ActionGuard, ConstrainedActions, appended_transforms
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.objectives import ConstrainedSACLoss
+from tests.torchrl_store import registered
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
 OURS = {
@@ -29,23 +26,6 @@ OURS = {
     "loss": ["constrained_sac"],
     "logger": ["rerun"],
 }
-
-
-@cache
-def registered() -> tuple[ModuleType, Any]:
-    """Return the module, and Hydra's store with TorchRL's groups and ours.
-
-    Hydra's own store is left without them: commands of the same process would warn of theirs.
-    """
-    Plugins.instance()  # registers Hydra's own, once a process
-    store = ConfigStore.instance()
-    before = deepcopy(store.repo)
-    try:
-        import_module("torchrl.trainers.algorithms.configs")
-        module = import_module("cnfp_torchrl.configuration.torchrl_groups")
-        return module, store.repo
-    finally:
-        store.repo = before
 
 
 @pytest.fixture(autouse=True)

@@ -88,6 +88,13 @@ def test_unlimited_it_draws_more(powers: list[float]) -> None:
     assert max(powers) > 25
 
 
+def test_rate_and_power_together(run: Callable[..., str], powers: list[float]) -> None:
+    printed = run("half_cheetah_limits", "--steps", 64)
+    assert len(powers) == 64
+    assert max(powers) <= 20
+    assert re.findall(r"(rate|power): 0 violations in 64 steps", printed) == ["rate", "power"]
+
+
 def test_takes_less_than_25_lines() -> None:
     """Everything counts, imports too, but blank lines, comments and docstrings."""
     with SCRIPT.open("rb") as file:

@@ -1,7 +1,11 @@
 """The learning examples on point navigation: they learn, and break no constraint."""
 
+import ast
 import re
+import runpy
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +16,8 @@ from torchrl.objectives import ClipPPOLoss
 
 from cnfp_torchrl.envs import constrain_env
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
 
 TINY: dict[str, tuple[object, ...]] = {
     "sac_made_safe": ("--steps", 512, "--agents", 16, "--updates", 2),
@@ -86,6 +92,26 @@ def test_without_the_line_it_breaks_constraints(
     # The script counts what the environment says, and this file agrees with it.
     for name in ("obstacle", "battery"):
         assert f"{name}: {counts[name]} violations in 2048 steps" in printed
+
+
+def test_the_marked_lines_are_all_that_makes_sac_safe(
+    tmp_path: Path, executed: Executed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    safe = (EXAMPLES / "sac_made_safe.py").read_text().splitlines()
+    plain = [line for line in safe if not line.endswith("  # safe")]
+    marked = len(safe) - len(plain)
+    assert 0 < marked <= 15
+    assert f"made safe by {marked} lines" in (EXAMPLES / "README.md").read_text()
+    script = tmp_path / "plain.py"
+    script.write_text("\n".join(plain))
+    names = {
+        node.id for node in ast.walk(ast.parse(script.read_text())) if isinstance(node, ast.Name)
+    }
+    assert not [name for name in names if "constrain" in name.lower() or "safe" in name]
+    monkeypatch.setattr(sys, "argv", ["plain.py", "--steps", "512", "--updates", "1"])
+    runpy.run_path(str(script), run_name="__main__")
+    assert len(np.concatenate(executed.actions)) == 512
+    assert sum(executed.violations().values()) > 20
 
 
 def test_the_sac_actor_itself_learns(load: Callable[[str], ModuleType]) -> None:

@@ -84,7 +84,7 @@ def test_a_missing_best_policy_is_named(run: RunFolder) -> None:
     best, kept = run.path / "best.pt", run.path / "kept"
     if best.exists():
         best.rename(kept)
-    with pytest.raises(FileNotFoundError, match=r"lacks \['best\.pt'\]"):
+    with pytest.raises(FileNotFoundError, match=r"^checkpoint: expected best\.pt"):
         load_policy(run.path, best=True)
     if kept.exists():
         kept.rename(best)

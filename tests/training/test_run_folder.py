@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from cnfp_torchrl.training.agent import build_actor, build_environment, load_actor
-from cnfp_torchrl.training.run_folder import CHECKPOINT, CONFIG, SUMMARY, RunFolder
+from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, CONFIG, SUMMARY, RunFolder
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
 
@@ -84,6 +84,13 @@ def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
     (tmp_path / CONFIG).write_text("seed: 0")
     with pytest.raises(FileNotFoundError, match=CHECKPOINT):
         RunFolder.open(tmp_path)
+
+
+def test_a_finished_run_without_a_best_policy_is_not_to_be_trained_again(tmp_path: Path) -> None:
+    for name in (CONFIG, CHECKPOINT):
+        (tmp_path / name).touch()
+    with pytest.raises(FileNotFoundError, match=f"^checkpoint: expected {BEST}.*{CHECKPOINT}$"):
+        RunFolder.open(tmp_path, BEST)
 
 
 @contextmanager

@@ -23,26 +23,46 @@ def told(position: list[float], battery: int, layout: Layout | None = None) -> t
     [
         # 0.45 from the station at (0.95, 0), 0.35 to its zone: 4 steps of 0.1; 0.2 from the wall x
         # = 0.3, 0.5 from the wall at 1.
-        ([0.5, 0.0], 43, ["23 steps are left above 20 %", "0.450 long, 4 steps to its zone"]),
+        (
+            [0.5, 0.0],
+            43,
+            ["23 steps are left above 20 %", "0.450 arena units long, 4 steps to its zone"],
+        ),
         ([0.5, 0.0], 20, ["0 steps are left above 20 %"]),
         ([0.5, 0.0], 19, ["below the threshold of 20 %"]),
-        ([0.9, 0.0], 100, ["80 steps are left", "0.050 long, in its zone"]),
-        ([0.5, 0.0], 43, ["nearest rectangle is 0.200 (2.0 steps) away", "wall is 0.500 (5.0"]),
+        ([0.9, 0.0], 100, ["80 steps are left", "0.050 arena units long, in its zone"]),
+        (
+            [0.5, 0.0],
+            43,
+            [
+                "nearest rectangle is 0.200 arena units (2.0 steps) away",
+                "wall is 0.500 arena units (5.0",
+            ],
+        ),
         # From the corner (0.3, 0.3) by Pythagoras: 0.3 and 0.4.
-        ([0.6, 0.7], 43, ["nearest rectangle is 0.500 (5.0 steps)", "wall is 0.300 (3.0 steps)"]),
+        (
+            [0.6, 0.7],
+            43,
+            [
+                "nearest rectangle is 0.500 arena units (5.0 steps)",
+                "wall is 0.300 arena units (3.0 steps)",
+            ],
+        ),
         ([0.1, 0.1], 43, ["touches a rectangle"]),
     ],
 )
 def test_distances_and_steps(position: list[float], battery: int, expected: list[str]) -> None:
     situation, said = told(position, battery)
-    assert f"At ({position[0]:.3f}, {position[1]:.3f}), battery {battery} %" in situation
+    assert (
+        f"At ({position[0]:.3f}, {position[1]:.3f}) arena units, battery {battery} %" in situation
+    )
     assert set(said) == {"charge", "walls"}
     for part in expected:
         assert part in " ".join(said.values())
 
 
 def test_goal_is_told() -> None:
-    assert "goal 0.500 away (5.0 steps)" in told([0.5, 0.6], 50)[0]
+    assert "goal 0.500 arena units away (5.0 steps)" in told([0.5, 0.6], 50)[0]
 
 
 def test_layout_without_rectangles() -> None:
