@@ -87,6 +87,15 @@ def test_wheel_carries_every_configuration_file(wheel: Path) -> None:
             assert archive.read(packed) == path.read_bytes()
 
 
+def test_wheel_carries_the_template_of_a_task(wheel: Path) -> None:
+    template = ROOT / "cnfp_torchrl" / "commands" / "new_task"
+    files = [path for path in template.iterdir() if path.is_file()]
+    assert files
+    with zipfile.ZipFile(wheel) as archive:
+        for path in files:
+            assert archive.read(path.relative_to(ROOT).as_posix()) == path.read_bytes()
+
+
 def test_wheel_holds_the_package_alone(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()

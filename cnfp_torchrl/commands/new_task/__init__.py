@@ -1,0 +1,1 @@
+"""A task with a constraint on its actions: environment, judge and geometry."""
