@@ -85,11 +85,11 @@ class RobotEnv(EnvBase):
         for index, robot in enumerate(self.robots):
             simulation: Any = robot.unwrapped
             robot.reset()
-            simulation.set_state(*(rows[index][key].numpy() for key in ("qpos", "qvel")))
+            simulation.set_state(*(rows[index][key].cpu().numpy() for key in ("qpos", "qvel")))
             if (action := rows[index].get(PREVIOUS_ACTION_KEY, None)) is not None:
-                simulation.data.ctrl[:] = action.numpy()
+                simulation.data.ctrl[:] = action.cpu().numpy()
         shown = [robot.unwrapped._get_obs() for robot in self.robots]  # type: ignore[attr-defined]
-        return TensorDict(self._observed(shown), self.batch_size)
+        return TensorDict(self._observed(shown), self.batch_size, device=self.device)
 
     def _make_specs(self) -> None:
         robot, batch = self.robots[0], self.batch_size
@@ -141,7 +141,7 @@ class RobotEnv(EnvBase):
                 f"{action[tuple(index)].item()}; look for the policy's first NaN (loc, scale, or "
                 "parameters after a diverged update)"
             )
-        actions = action.detach().reshape(len(self.robots), -1).numpy()
+        actions = action.detach().cpu().reshape(len(self.robots), -1).numpy()
         cost = np.zeros((len(self.robots), len(self.judges)))
         outcomes = []
         for index, robot in enumerate(self.robots):
