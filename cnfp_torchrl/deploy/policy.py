@@ -118,6 +118,9 @@ class DeployedPolicy(nn.Module):
         """
         states = self.states(*inputs)
         bounds = self.bounds.on(inputs[0].device)
+        # For each state: AOTInductor compiles no scalar constants, such as the width of one box.
+        low, high = (end.expand(inputs[0].shape[0], -1) for end in (bounds.low, bounds.high))
+        bounds = Box(low, high, validate_args=False)
         sets = self.sets(states)
         certified = _are_sound(inputs, sets)
         candidate = states.get(SAFE_ACTION_KEY, None)
