@@ -68,7 +68,9 @@ def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
 
 def publishes_constraints(env: EnvBase) -> bool:
     """Tell whether an environment's own transforms publish any constraint."""
-    return any(isinstance(each, ConstraintPublisher) for each in appended_transforms(env))
+    publishers = (t for t in appended_transforms(env) if isinstance(t, ConstraintPublisher))
+    # An anchor alone publishes none.
+    return any(not each.states_order or each.bijectors for each in publishers)
 
 
 def changed_actions(env: EnvBase) -> str | None:

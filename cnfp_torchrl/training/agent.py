@@ -14,6 +14,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 from torchrl.objectives import LossModule
 
 from cnfp_torchrl.envs import (
+    ConstraintAnchor,
     GeometryTransform,
     RewardPenalty,
     ShowTask,
@@ -80,7 +81,8 @@ def build_environment(
                 f"env.geometry: expected at least one constraint for {type(flow).__name__} to keep "
                 "to, given none; name its set there, or train with flow=unconstrained"
             )
-        return env
+        # Without constraints the anchor is the middle of the bounds, from which pictures look.
+        return env.append_transform(ConstraintAnchor([])) if with_anchor else env
     order = config.env.get("order")
     return constrain_env(
         env,
