@@ -231,7 +231,8 @@ def test_actions_before_the_boundary_have_a_latent(case: Case) -> None:
         action = bijector.region.anchor + direction / gauge * progress
         assert bijector.contains(action).all()
         error = (bijector(bijector.inverse_and_log_det(action)[0]) - action).abs().amax(-1)
-        assert error.max() <= 64 * torch.finfo(torch.float64).eps * case.size
+        # Half of it with one processor's kernels, two thirds with another's narrower ones.
+        assert error.max() <= 128 * torch.finfo(torch.float64).eps * case.size
 
 
 def test_what_does_not_fit_is_refused() -> None:
