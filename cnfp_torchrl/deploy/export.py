@@ -6,7 +6,6 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -17,6 +16,7 @@ from torch.export import Dim, ExportedProgram
 
 from cnfp_torchrl.deploy.operators import OperatorsOfOnnx
 from cnfp_torchrl.deploy.policy import DeployedPolicy
+from cnfp_torchrl.installed_versions import installed_versions
 from cnfp_torchrl.whole_file import write_json
 
 Format = Literal["onnx", "torch", "aoti"]
@@ -195,7 +195,7 @@ def _manifest(policy: DeployedPolicy, file: Path, to: Format) -> dict[str, Any]:
         "policy": "stochastic" if policy.stochastic else "deterministic",
         "steps": policy.steps,
         "fallback": fallback if policy.fallback is None else policy.fallback.tolist(),
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": {"python": platform.python_version(), **installed_versions(_PACKAGES)},
     }
 
 
@@ -207,17 +207,8 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
 def missing_packages(to: Sequence[str]) -> list[str]:
     """Return what formats need and is not installed."""
     needed = ["onnxscript", "onnxruntime"] if "onnx" in to else []
-    return [each for each in needed if each not in _versions()]
+    installed = installed_versions(needed)
+    return [each for each in needed if each not in installed]

@@ -7,11 +7,12 @@ import platform
 import shlex
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from cnfp_torchrl.installed_versions import installed_versions
 
 _PACKAGES = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco")
 
@@ -30,21 +31,11 @@ def provenance(device: str) -> dict[str, Any]:
     if device.startswith("cuda"):
         machine["accelerator"] = torch.cuda.get_device_name(device)
     return {
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": {"python": platform.python_version(), **installed_versions(_PACKAGES)},
         "commit": _commit(Path(__file__).parent),
         "command": shlex.join(sys.argv),
         "machine": machine,
     }
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def _commit(folder: Path) -> str | None:

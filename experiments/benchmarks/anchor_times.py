@@ -15,17 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import sys
-import time
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from statistics import median, quantiles
 from typing import Any
 
 import torch
+from interleaved import compared, processor, rounds, versions
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
@@ -118,26 +115,8 @@ def qpax_projection(sets: list[ConstraintSet]) -> Callable[[], Any]:
     return lambda: compiled(wish, matrix, limits).block_until_ready()
 
 
-def rounds_of(calls: dict[str, Callable[[], Any]], rounds: int, seconds: float) -> Any:
-    """Return the milliseconds of each call in each round, in processor time of all threads."""
-    counts = {}
-    for name, call in calls.items():
-        call()
-        start = time.process_time()
-        call()
-        counts[name] = max(1, round(seconds / (time.process_time() - start + 1e-6)))
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            start = time.process_time()
-            for _ in range(counts[name]):
-                call()
-            times[name].append(1e3 * (time.process_time() - start) / counts[name])
-    return times
-
-
 def measure(
-    case: tuple[int, int, int], relaxed: float, rounds: int, seconds: float, *, quick: bool
+    case: tuple[int, int, int], relaxed: float, count: int, seconds: float, *, quick: bool
 ) -> dict[str, Any]:
     """Return the times of anchors and flow, of qpax where there are rows alone, and ratios."""
     sets = problem(*case, relaxed)
@@ -147,14 +126,14 @@ def measure(
     }
     if relaxed and case[2] == 1 and not quick and find_spec("qpax"):
         calls["qpax"] = qpax_projection(problem(*case))
-    times = rounds_of(calls, rounds, seconds)
+    times = rounds(calls, count, seconds)
     given = (~lexicographic_anchor(sets).active.all(-1)).double().mean().item()
     row: dict[str, Any] = dict(zip(("batch", "dim", "constraints"), case, strict=True))
-    row |= {"relaxed": given, "ms": {name: median(values) for name, values in times.items()}}
+    row |= {"relaxed": given}
+    row["ms"] = {name: found["ms"] for name, found in compared(times, "anchor").items()}
     for other in set(times) - {"anchor"}:
-        ratios = [a / b for a, b in zip(times["anchor"], times[other], strict=True)]
-        low, middle, high = quantiles(ratios, n=4, method="inclusive")
-        row[f"/ {other}"] = {"ratio": middle, "low": low, "high": high}
+        ratio = compared(times, other)["anchor"]
+        row[f"/ {other}"] = {name: ratio[name] for name in ("ratio", "low", "high")}
     return row
 
 
@@ -189,19 +168,18 @@ def main() -> None:
     torch.manual_seed(0)
     cases = [(case, 0.0) for case in GROWTH]
     cases += [(case, share) for case in SHARES for share in (0.01, 0.1)]
-    rounds, seconds = arguments.rounds, 0.1
+    count, seconds = arguments.rounds, 0.1
     if arguments.quick:
-        cases, rounds, seconds = [((8, 2, 2), 0.0), ((8, 2, 1), 0.25)], 2, 1e-3
+        cases, count, seconds = [((8, 2, 2), 0.0), ((8, 2, 1), 0.25)], 2, 1e-3
     if not find_spec("qpax"):
         print("qpax is not installed (pip install 'cnfp_torchrl[bench]'): its column stays empty.")
-    rows = [measure(case, share, rounds, seconds, quick=arguments.quick) for case, share in cases]
+    rows = [measure(case, share, count, seconds, quick=arguments.quick) for case, share in cases]
     about = {
         "command": " ".join(["python experiments/benchmarks/anchor_times.py", *sys.argv[1:]]),
-        "python": platform.python_version(),
-        "processor": f"{platform.machine()}, {os.cpu_count()} cores, 1 thread",
-        "rounds": rounds,
+        "processor": processor(),
+        "rounds": count,
         "load": os.getloadavg()[0],
-        **{name: _version(name) for name in ("cnfp_torchrl", "torch", "numpy", "qpax", "jax")},
+        **versions("numpy", "qpax", "jax"),
     }
     arguments.output.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "rows": rows}
@@ -224,13 +202,6 @@ def main() -> None:
     text = "\n".join(lines)
     (arguments.output / "anchors.md").write_text(text)
     print(text)
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 if __name__ == "__main__":

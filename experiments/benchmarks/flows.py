@@ -18,13 +18,13 @@ import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
+from interleaved import versions
 from torch import Tensor
 from torch.distributions import Independent, Normal
 from torch.func import jacrev, vmap
@@ -257,10 +257,7 @@ def main() -> None:
             for constraints in counts:
                 rows.append(measure(batch, dim, constraints, quick=arguments.quick))
                 print(json.dumps(rows[-1]), flush=True)
-    versions = {
-        name: _version(name) for name in ("cnfp_torchrl", "torch", "torchrl", "cvxpylayers")
-    }
-    about = {"python": platform.python_version(), "processor": platform.machine(), **versions}
+    about = {"processor": platform.machine(), **versions("cvxpylayers")}
     arguments.output.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "unit": "ms", "rows": rows}
     (arguments.output / "flows.json").write_text(json.dumps(document, indent=1) + "\n")
@@ -287,13 +284,6 @@ def main() -> None:
     )
     (arguments.output / "flows.md").write_text(text)
     print(text)
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 if __name__ == "__main__":

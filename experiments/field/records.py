@@ -6,13 +6,13 @@ import dataclasses
 import json
 import os
 import platform
-import subprocess
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
 
+from cnfp_torchrl.installed_versions import installed_versions
 from cnfp_torchrl.whole_file import whole_file
+from experiments.checkout import commit
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "stable_baselines3", "numpy")
 
@@ -133,26 +133,11 @@ def read_records(data: Path) -> list[Record]:
 
 def about(device: str) -> dict[str, Any]:
     """Return versions and the kind of machine."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return {**found, "machine": machine, "device": device, "threads": 1, "commit": commit()}
-
-
-def commit() -> str | None:
-    """Return the checkout's commit, ending in ``-dirty`` if files differ, or None."""
-    try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return result.stdout.strip() or None
+    return {
+        "python": platform.python_version(),
+        **installed_versions(PACKAGES),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "device": device,
+        "threads": 1,
+        "commit": commit(),
+    }

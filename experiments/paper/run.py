@@ -14,7 +14,6 @@ import logging
 import os
 import platform
 import signal
-import subprocess
 from collections.abc import Mapping
 from contextlib import redirect_stderr
 from importlib.metadata import version
@@ -29,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.train import train
 from cnfp_torchrl.visual.figures import read_scalars
+from experiments.checkout import commit
 from experiments.paper.afterwards import evaluate_afterwards
 from experiments.paper.records import (
     Evaluation,
@@ -161,21 +161,6 @@ def versions() -> dict[str, str]:
         **{name: version(name) for name in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
-
-
-def commit() -> str | None:
-    """Return the checkout's commit, ending in ``-dirty`` if files differ, or None."""
-    try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return result.stdout.strip() or None
 
 
 def _differing(given: dict[str, Any], wanted: dict[str, Any]) -> list[str]:

@@ -11,9 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.figures import read_scalars
-from experiments.paper import run
+from experiments import checkout
+from experiments.checkout import commit
 from experiments.paper.records import Record, RecordError, load_records
-from experiments.paper.run import commit, do_run, settings
+from experiments.paper.run import do_run, settings
 from tests.training.conftest import TINY
 
 MakeConfig = Callable[..., DictConfig]
@@ -117,7 +118,7 @@ def test_a_run_without_a_method_is_refused(config: DictConfig, tmp_path: Path) -
 def test_the_commit_is_known_only_in_a_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "__file__", str(tmp_path / "run.py"))
+    monkeypatch.setattr(checkout, "__file__", str(tmp_path / "checkout.py"))
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert commit() is None
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@y", "-C", str(tmp_path)]

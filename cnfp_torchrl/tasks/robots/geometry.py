@@ -10,7 +10,7 @@ velocities are at least as tight. Rates: Liao et al. 2026, arXiv 2605.04185.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -28,19 +28,25 @@ class JointLimit(GeometryTransform):
         name: The constraint's name.
         limit: The largest value that is allowed, above 0.
         joints: The number d of driven joints, the last d coordinates.
-        key: The key of the coordinates or velocities, ``(*batch, n)``, n >= d.
+        key: The key of the coordinates or velocities, ``(*batch, n)``, n >= d; None takes those
+            that the limit is of, ``usual_key``.
         kwargs: Further options of `GeometryTransform`: ``margin`` and ``resolution``.
 
     Raises:
         ValueError: for a limit that is not positive, and without joints.
     """
 
-    def __init__(self, name: str, limit: float, joints: int, key: str, **kwargs: Any) -> None:
+    usual_key: ClassVar[str]
+    """The simulator's own coordinates or velocities, by which it is limited."""
+
+    def __init__(
+        self, name: str, limit: float, joints: int, key: str | None = None, **kwargs: Any
+    ) -> None:
         if not 0 < limit < float("inf"):
             raise ValueError(f"{name}.limit: expected a number > 0, given {limit}")
         if joints < 1:
             raise ValueError(f"{name}.joints: expected a number >= 1, given {joints}")
-        super().__init__(name, [key], **kwargs)
+        super().__init__(name, [key or self.usual_key], **kwargs)
         self.limit, self.joints = limit, joints
 
     def of_joints(self, tensordict: TensorDictBase) -> Tensor:
@@ -61,10 +67,7 @@ class PowerLimit(JointLimit):
         kwargs: Further options of `GeometryTransform`.
     """
 
-    def __init__(
-        self, name: str, limit: float, joints: int, key: str = "qvel", **kwargs: Any
-    ) -> None:
-        super().__init__(name, limit, joints, key, **kwargs)
+    usual_key = "qvel"
 
     def constraint_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the actions that take no more power than the limit."""
@@ -101,10 +104,7 @@ class BentEffortLimit(JointLimit):
         kwargs: Further options of `GeometryTransform`.
     """
 
-    def __init__(
-        self, name: str, limit: float, joints: int, key: str = "qpos", **kwargs: Any
-    ) -> None:
-        super().__init__(name, limit, joints, key, **kwargs)
+    usual_key = "qpos"
 
     def constraint_set(self, tensordict: TensorDictBase) -> ConstraintSet:
         """Return the actions whose effort is within the limit."""
@@ -139,7 +139,7 @@ class RateLimit(GeometryTransform):
     ) -> None:
         if not all(0 < limit < float("inf") for limit in limits):
             raise ValueError(f"{name}.limits: expected numbers > 0, given {list(limits)}")
-        super().__init__(name, [key], **kwargs)
+        super().__init__(name, [key or self.usual_key], **kwargs)
         self.register_buffer("limits", torch.tensor(list(limits)))
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
