@@ -243,7 +243,8 @@ class ConstraintSet(ABC):
     @property
     def dim(self) -> int:
         """The dimension d of the action space."""
-        return next(int(v.shape[-1]) for n, v in self.fields().items() if self.event_dims[n] > 0)
+        name = next(name for name, dims in self.event_dims.items() if dims > 0)
+        return int(getattr(self, name).shape[-1])
 
     @property
     def dtype(self) -> torch.dtype:

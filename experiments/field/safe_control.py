@@ -38,6 +38,7 @@ from experiments.field.records import about
 
 LAYERS = ("recession", "hardnet_aff")
 MOST, BATCH, LEARNING_RATE = 20_000.0, 100, 1e-4
+EVERYWHERE = Box(*torch.tensor([[-torch.inf], [torch.inf]]).double().expand(2, 2))
 TOLERANCE = 1e-4
 """The integrated excess from which HardNet counts a violation."""
 TRAINED, TESTED = slice(0, 833), slice(916, None)
@@ -71,9 +72,7 @@ def hardnet_aff(problem: Problem, net: nn.Module, state: Tensor) -> Tensor:
 
 def ours(layer: ConstraintLayer, problem: Problem, net: nn.Module, state: Tensor) -> Tensor:
     """Return what a layer makes of the wished control."""
-    everywhere = torch.full_like(state[:, :2], torch.inf)
-    sets = [Box(-everywhere, everywhere, validate_args=False), barrier_rows(problem, state)]
-    region = Region(sets, validate_args=False)
+    region = Region([EVERYWHERE, barrier_rows(problem, state)], validate_args=False)
     return layer(correction(net, state), region, nominal_control(state))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.bijectors import Recession, SoftRetraction
-from cnfp_torchrl.bijectors.recession import LEAST_MARGIN, common_way_out
+from cnfp_torchrl.bijectors.recession import LEAST_MARGIN, hull_point
 from cnfp_torchrl.geometry import Ball, Box, GeometryError, HalfSpaces, Region
 from tests.bijectors import reference
 from tests.bijectors.cases import CASES, DTYPES, Case
@@ -125,7 +125,7 @@ def test_the_way_out_has_the_largest_margin(rows: int, dim: int) -> None:
     normals = barriers(rows, dim, torch.float64, 50).normals
     normals = normals / vector_norm(normals, dim=-1, keepdim=True)
     way = torch.nn.functional.normalize(
-        common_way_out(normals, torch.ones(50, rows, dtype=torch.bool)), dim=-1
+        -hull_point(normals, torch.ones(50, rows, dtype=torch.bool)), dim=-1
     )
     margin = -(normals * way.unsqueeze(-2)).sum(-1).amax(-1)
     best = [largest_margin(each.numpy()) for each in normals]
