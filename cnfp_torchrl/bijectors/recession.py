@@ -47,7 +47,9 @@ class Recession(Bijector):
 
     The slope vanishes like :math:`e^{-need/s}` beyond the rows, so that the inverse is right to
     rounding for actions whose slack in all rows is some hundred rounding errors, and may be
-    infinite or NaN closer to a row (`contains` is false).
+    infinite or NaN closer to a row (`contains` is false). What it finds becomes the same action
+    again, up to some d + 8 rounding errors of the wished action times :math:`1 + 1/\rho`, where
+    :math:`\rho = \min_k -A_k r` for rows of length 1.
 
     A region with an anchor may have finite bounds and further sets: the recession comes first, then
     a soft retraction along rays (`SoftRetraction`) of their intersection onto that with the rest.
