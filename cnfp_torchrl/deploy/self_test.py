@@ -34,8 +34,8 @@ def observed_states(
     """
     steps = -(-count // (2 * max(env.numel(), 1)))
     rollouts: list[Any] = [
-        env.rollout(steps, each, break_when_any_done=False).reshape(-1)
-        for each in (SafeRandomPolicy(actor), actor)
+        env.rollout(steps, policy, break_when_any_done=False).reshape(-1)
+        for policy in (SafeRandomPolicy(actor), actor)
     ]
     visited: Any = torch.cat(rollouts)
     chosen = visited[torch.randperm(len(visited))[:count]]
@@ -75,8 +75,8 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
         bounds = policy.bounds.on(None)
         within = bounds.contains(action)
         inside = within.clone()
-        for each in policy.sets(policy.states(*given)):
-            inside &= each.contains(action)
+        for constraint_set in policy.sets(policy.states(*given)):
+            inside &= constraint_set.contains(action)
         both = certified & eager_certified
         if bool(both.any()):
             largest = max(largest, float((action - eager)[both].abs().amax()))

@@ -333,7 +333,7 @@ class ConstraintSet(ABC):
         bad = [mask.any() for _, mask, _ in self.invalid_fields()]
         like = next(iter(self.fields().values()))
         good = good or [torch.ones((), dtype=torch.bool, device=like.device)]
-        return torch.stack([*good, *(~each for each in bad)]).all()
+        return torch.stack([*good, *(~mask for mask in bad)]).all()
 
     def validate_shapes(self, where: str) -> None:
         """Refuse fields of wrong types or shapes, without reading their values.
