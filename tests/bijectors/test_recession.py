@@ -130,7 +130,7 @@ def test_the_way_out_has_the_largest_margin(rows: int, dim: int) -> None:
         -hull_point(normals, torch.ones(50, rows, dtype=torch.bool)), dim=-1
     )
     margin = -(normals * way.unsqueeze(-2)).sum(-1).amax(-1)
-    best = [largest_margin(each.numpy()) for each in normals]
+    best = [largest_margin(normal.numpy()) for normal in normals]
     torch.testing.assert_close(
         margin, torch.tensor(best, dtype=torch.float64), rtol=1e-4, atol=1e-6
     )
