@@ -27,6 +27,7 @@ from cnfp_torchrl.tasks.safe_control import (
     Problem,
     barrier_excess,
     barrier_rows,
+    encoded,
     episode,
     nominal_control,
     starts,
@@ -58,8 +59,8 @@ def network() -> nn.Sequential:
 
 def correction(net: nn.Module, state: Tensor) -> Tensor:
     """Return the network's addition to the nominal control."""
-    theta = state[:, 2:3]
-    return net(torch.cat([state[:, :2], theta.cos(), theta.sin(), state[:, 3:]], -1))
+    correction: Tensor = net(encoded(state))
+    return correction
 
 
 def hardnet_aff(problem: Problem, net: nn.Module, state: Tensor) -> Tensor:
