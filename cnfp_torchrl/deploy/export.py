@@ -114,10 +114,10 @@ def _open_onnx(path: Path) -> Run:
     options.intra_op_num_threads = 1
     options.log_severity_level = 3  # it warns of constants that it does not fold
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    names = [each.name for each in session.get_inputs()]
+    names = [tensor.name for tensor in session.get_inputs()]
 
     def run(*inputs: Tensor) -> tuple[Tensor, Tensor]:
-        given = {name: each.numpy() for name, each in zip(names, inputs, strict=True)}
+        given = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
         action, certified = session.run(list(OUTPUTS), given)
         return torch.from_numpy(action), torch.from_numpy(certified)
 
@@ -187,7 +187,8 @@ def _manifest(policy: DeployedPolicy, file: Path, to: Format) -> dict[str, Any]:
         "action_bounds": {"low": bounds.low.tolist(), "high": bounds.high.tolist()},
         "units": "those of the environment's own observations and actions; nothing is rescaled",
         "constraints": [
-            {"name": each.name, "family": each.set_type.__name__} for each in policy.bijectors
+            {"name": bijector.name, "family": bijector.set_type.__name__}
+            for bijector in policy.bijectors
         ],
         "priority": "the last constraint has the highest; a state in which not all hold together "
         "is not certified",
@@ -211,4 +212,4 @@ def missing_packages(to: Sequence[str]) -> list[str]:
     """Return what formats need and is not installed."""
     needed = ["onnxscript", "onnxruntime"] if "onnx" in to else []
     installed = installed_versions(needed)
-    return [each for each in needed if each not in installed]
+    return [package for package in needed if package not in installed]

@@ -84,7 +84,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         super().__init__()
         self._leeway = leeway
         self._bijectors = in_order(bijectors, order)
-        self._watch = RelaxationWatch([each.name for each in self._bijectors], leeway)
+        self._watch = RelaxationWatch([bijector.name for bijector in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
         # Those whose checks are settled here, looked up at the first step of an episode.
@@ -106,11 +106,11 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         bounds = self._action_bounds()
         # In the dtype of the actions, as the flow will see them.
         sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
-        for bijector, each in zip(self._bijectors, sets, strict=True):
-            if each.dim != bounds.dim:
+        for bijector, constraint_set in zip(self._bijectors, sets, strict=True):
+            if constraint_set.dim != bounds.dim:
                 raise GeometryError(
                     f"constraint '{bijector.name}': expected a set of actions with {bounds.dim} "
-                    f"components, as the action spec has, given one with {each.dim}"
+                    f"components, as the action spec has, given one with {constraint_set.dim}"
                 )
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
@@ -144,9 +144,9 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         """
         if self._geometries is None:
             appended = appended_transforms(self.container)
-            before = takewhile(lambda each: each is not self, appended)
-            self._geometries = [each for each in before if isinstance(each, GeometryTransform)]
-        checks = [check for each in self._geometries if (check := each.pending_check())]
+            before = takewhile(lambda transform: transform is not self, appended)
+            self._geometries = [t for t in before if isinstance(t, GeometryTransform)]
+        checks = [check for t in self._geometries if (check := t.pending_check())]
         if not checks:
             return bool(decided)
         all_decided, good = torch.stack([decided, are_good(checks)]).tolist()
@@ -195,14 +195,17 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
 
     def _refuse_unseen_steps(self) -> None:
         """Refuse transforms behind this one that act in states for which it published nothing."""
-        behind = dropwhile(lambda each: each is not self, appended_transforms(self.container))
-        for each in behind:
-            if isinstance(each, UNSEEN_STEPS):
+        after = dropwhile(
+            lambda transform: transform is not self, appended_transforms(self.container)
+        )
+        for transform in after:
+            if isinstance(transform, UNSEEN_STEPS):
+                kind = type(transform).__name__
                 raise ValueError(
-                    f"{type(each).__name__}: expected inside the environment that is constrained, "
+                    f"{kind}: expected inside the environment that is constrained, "
                     "given one around it, which executes actions in states for which nobody asked "
                     "what they allow; write constrain_env(TransformedEnv(env, "
-                    f"{type(each).__name__}(...)), ...), whose geometry must hold for all steps of "
+                    f"{kind}(...)), ...), whose geometry must hold for all steps of "
                     "one action"
                 )
 

@@ -285,9 +285,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
             return
         # Nobody has settled the last one: whoever did is not behind this transform any more.
         left, self._check, self._is_settled_by_another = self._check, None, False
-        for each in (left, check):
-            if each is not None and not bool(are_good([each])):
-                each.refuse()
+        for pending in (left, check):
+            if pending is not None and not bool(are_good([pending])):
+                pending.refuse()
 
     def _refuse_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
         self._refuse_what_is_not_finite(states)
@@ -377,7 +377,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         for field, value in allowed.fields().items():
             event, batch = allowed.event_dims[field], states.batch_size
             given, alone = value, other.fields()[field]
-            shapes = [tuple(each.shape[each.ndim - event :]) for each in (given, alone)]
+            shapes = [tuple(values.shape[values.ndim - event :]) for values in (given, alone)]
             where = f"constraint '{self.name}', field '{field}'"
             if shapes[0] != shapes[1]:
                 raise GeometryError(

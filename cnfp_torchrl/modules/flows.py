@@ -166,7 +166,9 @@ class RecessionFlow(Flow):
         bounds, *others = sets
         assert isinstance(bounds, Box)
         unbounded = bool((bounds.low.isinf() & bounds.high.isinf()).all())
-        return not (unbounded and all(isinstance(each, HalfSpaces) for each in others))
+        return not (
+            unbounded and all(isinstance(constraint_set, HalfSpaces) for constraint_set in others)
+        )
 
     def _recession(self, region: Region, *, of_latents: bool) -> Recession:
         return Recession(
@@ -268,7 +270,7 @@ def resolve_safe_flow(flow: Flow | str) -> Flow:
     """
     resolved = resolve_flow(flow)
     if not resolved.is_safe:
-        safe = [name for name, each in FLOWS.items() if each.is_safe]
+        safe = [name for name, flow in FLOWS.items() if flow.is_safe]
         raise ValueError(
             f"flow: expected one that guarantees the constraints, such as {safe}, given "
             f"{type(resolved).__name__}"
