@@ -61,7 +61,10 @@ class Case:
         return self.sets[0].dim
 
     def region(self, dtype: torch.dtype = torch.float64) -> Region:
-        sets = tuple(each.with_fields(lambda field, _: field.to(dtype)) for each in self.sets)
+        sets = tuple(
+            constraint_set.with_fields(lambda field, _: field.to(dtype))
+            for constraint_set in self.sets
+        )
         return Region(sets, torch.zeros(self.dim, dtype=dtype), validate_args=False)
 
 
@@ -186,7 +189,9 @@ def by_scipy(case: Case, point: Tensor) -> Tensor:
         lambda a: 0.5 * np.sum((a - point.numpy()) ** 2),
         x0=np.zeros(case.dim),
         jac=lambda a: a - point.numpy(),
-        constraints=[{"type": "ineq", "fun": inequality(each)} for each in case.sets],
+        constraints=[
+            {"type": "ineq", "fun": inequality(constraint_set)} for constraint_set in case.sets
+        ],
         method="SLSQP",
         options={"ftol": 1e-14, "maxiter": 500},
     )
@@ -241,7 +246,9 @@ def test_gradients_are_the_projection_s(case: Case) -> None:
 @ALL_CASES
 def test_gradients_are_finite_where_points_are_special(case: Case) -> None:
     special = [torch.zeros(case.dim), torch.ones(case.dim), torch.full((case.dim,), 1e6)]
-    special += [each.center for each in case.sets if isinstance(each, Ball)]
+    special += [
+        constraint_set.center for constraint_set in case.sets if isinstance(constraint_set, Ball)
+    ]
     for point in special:
         given = point.double().clone().requires_grad_()
         project_onto_intersection(case.region(), given, case.rounds).sum().backward()
