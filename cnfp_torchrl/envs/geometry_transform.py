@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -148,8 +147,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             TypeError: when it is no `ConstraintSet`.
             GeometryError: for another family than before, and one that breaks the contract.
         """
-        with self._naming_the_constraint("constraint_set"):
-            allowed = self.constraint_set(tensordict)
+        allowed = self._own("constraint_set", self.constraint_set, tensordict)
         if type(allowed) is not self._family:
             self._refuse_what_is_no_set(allowed)
             self._family = type(allowed)
@@ -323,8 +321,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
                         f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
                     ) from None
             entries[field_key(self.name, field)] = value.contiguous()
-        with self._naming_the_constraint("safe_action"):
-            action = self.safe_action(tensordict, allowed)
+        action = self._own("safe_action", self.safe_action, tensordict, allowed)
         if action is not None:
             expected = (*batch, allowed.dim)
             _refuse_other_shape(f"{self._at('safe_action')}: expected None or", action, expected)
@@ -334,11 +331,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _at(self, method: str) -> str:
         return f"constraint '{self.name}', {type(self).__name__}.{method}"
 
-    @contextmanager
-    def _naming_the_constraint(self, method: str) -> Iterator[None]:
-        """Add the names of constraint and method to errors of a constraint's own code."""
+    def _own(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a constraint's own code; its errors get the names of constraint and method."""
         try:
-            yield
+            return call(*arguments)
         except AttributeError as error:
             # An environment would report the AttributeError itself as a missing spec.
             raise GeometryError(f"{self._at(method)}: AttributeError: {error}") from error
@@ -407,8 +403,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
         zeros = next(iter(allowed.fields().values())).new_zeros(*batch, allowed.dim)
         method = f"constraint_set, {type(allowed).__name__}.slack"
-        with self._naming_the_constraint(method):
-            slack = allowed.slack(zeros)
+        slack = self._own(method, allowed.slack, zeros)
         given = f"for actions {tuple(zeros.shape)} expected"
         _refuse_other_shape(f"{self._at(method)}: {given}", slack, batch)
 

@@ -349,6 +349,11 @@ def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDict
 # Settings -----------------------------------------------------------------------------------------
 
 
+def test_one_threshold_is_that_of_all_constraints(make_loss: MakeLoss) -> None:
+    loss = make_loss(thresholds=0.3, constraint_names=["obstacle", "battery"])
+    assert loss.thresholds.tolist() == pytest.approx([0.3, 0.3])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
