@@ -42,6 +42,8 @@ from cnfp_torchrl.whole_file import whole_file
 RESULT = Path(__file__).parent / "results" / "resume.md"
 
 OF_THE_CLOCK = ("train/seconds", "train/processor_seconds", "train/steps_per_second")
+OF_THE_PROCESS = ("seconds", "command", "commit")
+"""What a summary says of the process that wrote it, and not of the policy."""
 
 SETTINGS = (
     "training.warmup_frames=400",
@@ -54,19 +56,18 @@ SETTINGS = (
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Return what differs between two finished runs, but for what a clock tells."""
+    """Return what differs between two finished runs, but for their times and commands."""
     runs = [_content(path) for path in (first, second)]
     return [name for name in runs[0] if not _equal(runs[0][name], runs[1][name])]
 
 
 def _content(path: Path) -> dict[str, Any]:
     summary = json.loads((path / SUMMARY).read_text())
-    del summary["seconds"]
     scalars = path / "metrics" / "scalars"
     rows = {str(file.relative_to(scalars)): file for file in scalars.rglob("*.csv")}
     return {
         "checkpoint": RunFolder(path).load_checkpoint(),
-        "summary": summary,
+        "summary": {name: value for name, value in summary.items() if name not in OF_THE_PROCESS},
         "CSV": {n: f.read_text() for n, f in rows.items() if n[: -len(".csv")] not in OF_THE_CLOCK},
         "TensorBoard": _events(path / "tensorboard"),
     }

@@ -11,13 +11,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 import torch
-
-from tests.torchrl_store import registered
+from hydra.core.config_store import ConfigStore
 
 
 def pytest_configure() -> None:
-    # Whatever imports TorchRL's groups later finds them imported, and Hydra's store as it was.
-    registered()
     # pytest-xdist starts one worker per core; more threads than that only wait for each other.
     torch.set_num_threads(1)
 
@@ -31,6 +28,16 @@ def logging_as_before() -> Iterator[None]:
     for handler in set(root.handlers) - set(before):
         root.removeHandler(handler)
         handler.close()
+
+
+@pytest.fixture(autouse=True)
+def store_of_our_configurations() -> Iterator[None]:
+    """Hold Hydra's store free of TorchRL's groups, which other tests' commands would be held to.
+
+    A test that needs them takes ``registered`` of ``tests/configuration/test_torchrl_groups.py``.
+    """
+    yield
+    assert "trainer" not in ConfigStore.instance().repo
 
 
 @pytest.fixture(autouse=True)

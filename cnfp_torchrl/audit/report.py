@@ -280,7 +280,7 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         [
             "executed",
             "violations",
-            *(f"while {each}" for each in CONSTRAINT_STATES),
+            *(f"while {state}" for state in CONSTRAINT_STATES),
             "after it had held",
         ]
     ]

@@ -201,8 +201,14 @@ def split(
     sets: Sequence[ConstraintSet], *, by_boxes: bool
 ) -> tuple[list[Box], list[ConstraintSet]]:
     """Return the boxes among some sets, if they retract by components, and the other sets."""
-    boxes = [each for each in sets if by_boxes and isinstance(each, Box)]
-    return boxes, [each for each in sets if not (by_boxes and isinstance(each, Box))]
+    boxes = [
+        constraint_set for constraint_set in sets if by_boxes and isinstance(constraint_set, Box)
+    ]
+    return boxes, [
+        constraint_set
+        for constraint_set in sets
+        if not (by_boxes and isinstance(constraint_set, Box))
+    ]
 
 
 class _ComponentScale:

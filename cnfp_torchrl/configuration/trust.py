@@ -131,7 +131,7 @@ def foreign_packages(config: DictConfig) -> list[str]:
     """Return what whoever reads a run of a configuration has to trust, such as ``my_package.``."""
     content = OmegaConf.to_container(config, resolve=True)
     assert isinstance(content, dict)
-    named = {str(each) for each in targets([content.get(name) for name in BUILT])} - nameable()
+    named = {str(target) for target in targets([content.get(name) for name in BUILT])} - nameable()
     return sorted({f"{_top(name)}." for name in named})
 
 
@@ -171,7 +171,7 @@ def _shipped() -> tuple[Mapping[str, frozenset[str]], frozenset[str]]:
         for section, part in [(group, content)] if is_section else content.items():
             found.setdefault(section, set()).update(targets(part))
         texts.update(_texts(content))
-    return {name: frozenset(each) for name, each in found.items()}, frozenset(texts)
+    return {name: frozenset(values) for name, values in found.items()}, frozenset(texts)
 
 
 def _texts(content: Any) -> Iterator[str]:

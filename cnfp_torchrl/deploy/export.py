@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
+from cnfp_torchrl.deploy.notices import without_exporters_notices
 from cnfp_torchrl.deploy.operators import OperatorsOfOnnx
 from cnfp_torchrl.deploy.policy import DeployedPolicy
 from cnfp_torchrl.installed_versions import installed_versions
@@ -56,12 +57,13 @@ def export_policy(policy: DeployedPolicy, folder: str | Path, to: Format = "onnx
             f"folder: expected one without {held}, given {folder}; nothing is overwritten"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    if to == "onnx":
-        _write_onnx(policy, file)
-    elif to == "torch":
-        torch.export.save(_program(policy), file)
-    else:
-        torch._inductor.aoti_compile_and_package(_program(policy), package_path=str(file))
+    with without_exporters_notices():
+        if to == "onnx":
+            _write_onnx(policy, file)
+        elif to == "torch":
+            torch.export.save(_program(policy), file)
+        else:
+            torch._inductor.aoti_compile_and_package(_program(policy), package_path=str(file))
     write_manifest(folder, _manifest(policy, file, to))
     return file
 
@@ -114,10 +116,10 @@ def _open_onnx(path: Path) -> Run:
     options.intra_op_num_threads = 1
     options.log_severity_level = 3  # it warns of constants that it does not fold
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    names = [each.name for each in session.get_inputs()]
+    names = [tensor.name for tensor in session.get_inputs()]
 
     def run(*inputs: Tensor) -> tuple[Tensor, Tensor]:
-        given = {name: each.numpy() for name, each in zip(names, inputs, strict=True)}
+        given = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
         action, certified = session.run(list(OUTPUTS), given)
         return torch.from_numpy(action), torch.from_numpy(certified)
 
@@ -187,7 +189,8 @@ def _manifest(policy: DeployedPolicy, file: Path, to: Format) -> dict[str, Any]:
         "action_bounds": {"low": bounds.low.tolist(), "high": bounds.high.tolist()},
         "units": "those of the environment's own observations and actions; nothing is rescaled",
         "constraints": [
-            {"name": each.name, "family": each.set_type.__name__} for each in policy.bijectors
+            {"name": bijector.name, "family": bijector.set_type.__name__}
+            for bijector in policy.bijectors
         ],
         "priority": "the last constraint has the highest; a state in which not all hold together "
         "is not certified",
@@ -211,4 +214,4 @@ def missing_packages(to: Sequence[str]) -> list[str]:
     """Return what formats need and is not installed."""
     needed = ["onnxscript", "onnxruntime"] if "onnx" in to else []
     installed = installed_versions(needed)
-    return [each for each in needed if each not in installed]
+    return [package for package in needed if package not in installed]

@@ -35,7 +35,9 @@ class OperatorsOfOnnx(TorchFunctionMode):
 
 def _where(condition: Tensor, chosen: Any, other: Any) -> Any:
     """Choose among flags; onnxruntime chooses among numbers alone."""
-    if not all(isinstance(each, Tensor) and each.dtype == torch.bool for each in (chosen, other)):
+    if not all(
+        isinstance(value, Tensor) and value.dtype == torch.bool for value in (chosen, other)
+    ):
         return NotImplemented
     return (condition & chosen) | (~condition & other)
 

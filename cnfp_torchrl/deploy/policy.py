@@ -153,15 +153,15 @@ class DeployedPolicy(nn.Module):
 
     def sets(self, states: TensorDictBase) -> list[ConstraintSet]:
         """Return the constraints' sets in order of application, in the dtype of actions."""
-        return [each.get_set(states).to(self.action_dtype) for each in self.bijectors]
+        return [bijector.get_set(states).to(self.action_dtype) for bijector in self.bijectors]
 
     def _publish(self, states: TensorDictBase, anchor: Tensor, decided: Tensor) -> None:
         """Publish what a network may read of the anchor; it counts where all constraints hold."""
         states.set(ANCHOR_KEY, anchor)
         zero = anchor[..., 0] * 0
-        for each in self.bijectors:
-            states.set(each.active_key, decided)
-            states.set(each.relaxation_key, zero)
+        for bijector in self.bijectors:
+            states.set(bijector.active_key, decided)
+            states.set(bijector.relaxation_key, zero)
 
     def _fallback(self, bounds: Box, anchor: Tensor) -> Tensor:
         inner = bounds.eroded(bounds.magnitude())
@@ -197,25 +197,25 @@ class DeployedPolicy(nn.Module):
 
 def _geometries(env: EnvBase, order: Sequence[str]) -> list[GeometryTransform]:
     transforms = appended_transforms(env)
-    found = [each for each in transforms if isinstance(each, GeometryTransform)]
-    if missing := set(order) - {each.name for each in found}:
+    found = [transform for transform in transforms if isinstance(transform, GeometryTransform)]
+    if missing := set(order) - {transform.name for transform in found}:
         raise ValueError(
             f"env: expected a GeometryTransform for each constraint, given none for "
             f"{sorted(missing)}"
         )
-    return [each for each in found if each.name in order]
+    return [transform for transform in found if transform.name in order]
 
 
 def _refuse_changed_inputs(env: EnvBase, keys: Sequence[NestedKey]) -> None:
     """Refuse transforms by which geometry and network read other values under the same key."""
     behind = False
-    for each in appended_transforms(env):
-        behind = behind or isinstance(each, GeometryTransform)
-        changed = [key for key in each.out_keys if key in keys]
-        if behind and changed and not isinstance(each, GeometryTransform):
+    for transform in appended_transforms(env):
+        behind = behind or isinstance(transform, GeometryTransform)
+        changed = [key for key in transform.out_keys if key in keys]
+        if behind and changed and not isinstance(transform, GeometryTransform):
             raise ValueError(
                 f"env: expected no transform that changes {changed} behind the geometries, which "
-                f"read them, given {type(each).__name__}; put it into the environment that is "
+                f"read them, given {type(transform).__name__}; put it into the environment that is "
                 "constrained, or into the network"
             )
 
@@ -223,17 +223,17 @@ def _refuse_changed_inputs(env: EnvBase, keys: Sequence[NestedKey]) -> None:
 def _are_deep(sets: Sequence[ConstraintSet], anchor: Tensor) -> Tensor:
     """Tell which points have the depth of an anchor in all rows of all sets, ``(B,)``."""
     deep = anchor.isfinite().all(-1)
-    for each, depth in zip(sets, row_depths(sets), strict=True):
-        deep = deep & (each.row_slacks(anchor) >= depth).all(-1)
+    for constraint_set, depth in zip(sets, row_depths(sets), strict=True):
+        deep = deep & (constraint_set.row_slacks(anchor) >= depth).all(-1)
     return deep
 
 
 def _are_sound(inputs: Sequence[Tensor], sets: Sequence[ConstraintSet]) -> Tensor:
     """Tell where inputs are finite and sets valid, ``(B,)``."""
     bad: list[Any] = [~value.isfinite() for value in inputs if value.is_floating_point()]
-    for each in sets:
-        bad += [value.isnan() for value in each.fields().values()]
-        bad += [mask for _, mask, _ in each.invalid_fields()]
+    for constraint_set in sets:
+        bad += [value.isnan() for value in constraint_set.fields().values()]
+        bad += [mask for _, mask, _ in constraint_set.invalid_fields()]
     sound = torch.ones_like(inputs[0].flatten(1)[:, 0], dtype=torch.bool)
     for mask in bad:
         sound = sound & ~(mask.flatten(1).any(-1) if mask.ndim > 1 else mask)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -34,8 +34,8 @@ def observed_states(
     """
     steps = -(-count // (2 * max(env.numel(), 1)))
     rollouts: list[Any] = [
-        env.rollout(steps, each, break_when_any_done=False).reshape(-1)
-        for each in (SafeRandomPolicy(actor), actor)
+        env.rollout(steps, policy, break_when_any_done=False).reshape(-1)
+        for policy in (SafeRandomPolicy(actor), actor)
     ]
     visited: Any = torch.cat(rollouts)
     chosen = visited[torch.randperm(len(visited))[:count]]
@@ -75,8 +75,8 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
         bounds = policy.bounds.on(None)
         within = bounds.contains(action)
         inside = within.clone()
-        for each in policy.sets(policy.states(*given)):
-            inside &= each.contains(action)
+        for constraint_set in policy.sets(policy.states(*given)):
+            inside &= constraint_set.contains(action)
         both = certified & eager_certified
         if bool(both.any()):
             largest = max(largest, float((action - eager)[both].abs().amax()))
@@ -101,7 +101,10 @@ def with_noise(policy: DeployedPolicy, inputs: Sequence[Tensor]) -> tuple[Tensor
 
 @torch.no_grad()
 def latencies(
-    runs: Mapping[str, Run], inputs: Sequence[Tensor], rounds: int = 200
+    runs: Mapping[str, Run],
+    inputs: Sequence[Tensor],
+    rounds: int = 200,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
     """Return the median time of one call with one state, in milliseconds, by turns of all runs.
 
@@ -109,12 +112,13 @@ def latencies(
         runs: Policies by their names.
         inputs: The inputs of one state, ``(1, *event)`` each.
         rounds: The number of calls of each.
+        clock: The clock, in seconds; `time.thread_time` on a machine that others load.
     """
     taken: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(rounds + 10):
         for name, run in runs.items():
-            started = time.perf_counter()
+            started = clock()
             run(*inputs)
             if turn >= 10:
-                taken[name].append(1e3 * (time.perf_counter() - started))
+                taken[name].append(1e3 * (clock() - started))
     return {name: statistics.median(times) for name, times in taken.items()}

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform, are_good
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
 from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, begin_anchor, finish_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
@@ -84,7 +84,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         super().__init__()
         self._leeway = leeway
         self._bijectors = in_order(bijectors, order)
-        self._watch = RelaxationWatch([each.name for each in self._bijectors], leeway)
+        self._watch = RelaxationWatch([bijector.name for bijector in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
         # Those whose checks are settled here, looked up at the first step of an episode.
@@ -106,11 +106,11 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         bounds = self._action_bounds()
         # In the dtype of the actions, as the flow will see them.
         sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
-        for bijector, each in zip(self._bijectors, sets, strict=True):
-            if each.dim != bounds.dim:
+        for bijector, constraint_set in zip(self._bijectors, sets, strict=True):
+            if constraint_set.dim != bounds.dim:
                 raise GeometryError(
                     f"constraint '{bijector.name}': expected a set of actions with {bounds.dim} "
-                    f"components, as the action spec has, given one with {each.dim}"
+                    f"components, as the action spec has, given one with {constraint_set.dim}"
                 )
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
@@ -126,11 +126,12 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                 self._watch.all_held(batch.numel())
             else:
                 self._watch([bounds, *sets], found.largest(), batch.numel())
-        next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
+        next_tensordict.set(ANCHOR_KEY, _expanded(found.anchor, batch))
+        active = _expanded(found.active, batch).unbind(-1)
         for stage, bijector in enumerate(self._bijectors, start=1):
-            rows = found.relaxation[stage].expand(*batch, found.relaxation[stage].shape[-1])
+            rows = _expanded(found.relaxation[stage], batch)
             largest = rows.squeeze(-1) if rows.shape[-1] == 1 else rows.amax(-1)
-            next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))
+            next_tensordict.set(bijector.active_key, active[stage])
             next_tensordict.set(bijector.relaxation_key, largest)
             if bijector.row_relaxation_key is not None:
                 next_tensordict.set(bijector.row_relaxation_key, rows)
@@ -143,14 +144,16 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         """
         if self._geometries is None:
             appended = appended_transforms(self.container)
-            before = takewhile(lambda each: each is not self, appended)
-            self._geometries = [each for each in before if isinstance(each, GeometryTransform)]
-        checks = [check for each in self._geometries if (check := each.pending_check())]
-        good = torch.stack([decided, *(check.good for check in checks)]).tolist()
-        for check, is_good in zip(checks, good[1:], strict=True):
-            if not is_good:
+            before = takewhile(lambda transform: transform is not self, appended)
+            self._geometries = [t for t in before if isinstance(t, GeometryTransform)]
+        checks = [check for t in self._geometries if (check := t.pending_check())]
+        if not checks:
+            return bool(decided)
+        all_decided, good = torch.stack([decided, are_good(checks)]).tolist()
+        if not good:
+            for check in checks:
                 check.refuse()
-        return bool(good[0])
+        return bool(all_decided)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -192,14 +195,17 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
 
     def _refuse_unseen_steps(self) -> None:
         """Refuse transforms behind this one that act in states for which it published nothing."""
-        behind = dropwhile(lambda each: each is not self, appended_transforms(self.container))
-        for each in behind:
-            if isinstance(each, UNSEEN_STEPS):
+        after = dropwhile(
+            lambda transform: transform is not self, appended_transforms(self.container)
+        )
+        for transform in after:
+            if isinstance(transform, UNSEEN_STEPS):
+                kind = type(transform).__name__
                 raise ValueError(
-                    f"{type(each).__name__}: expected inside the environment that is constrained, "
+                    f"{kind}: expected inside the environment that is constrained, "
                     "given one around it, which executes actions in states for which nobody asked "
                     "what they allow; write constrain_env(TransformedEnv(env, "
-                    f"{type(each).__name__}(...)), ...), whose geometry must hold for all steps of "
+                    f"{kind}(...)), ...), whose geometry must hold for all steps of "
                     "one action"
                 )
 
@@ -237,3 +243,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
             self._bounds = ActionBounds(bounds)
         return self._bounds.on(device)
+
+
+def _expanded(value: Tensor, batch: torch.Size) -> Tensor:
+    """Return values ``(..., m)`` as ``(*batch, m)``."""
+    return value if value.shape[:-1] == batch else value.expand(*batch, value.shape[-1])

@@ -70,7 +70,7 @@ def constrain_env(
     if not with_anchor and order is not None:
         # There is no anchor to state the priority, which is then that of the transforms.
         wanted = {name: position for position, name in enumerate(order)}
-        geometries = tuple(sorted(geometries, key=lambda each: wanted.get(each.name, 0)))
+        geometries = tuple(sorted(geometries, key=lambda geometry: wanted.get(geometry.name, 0)))
     published = TransformedEnv(env, Compose(*geometries), auto_unwrap=True)
     _ = published.observation_spec  # calls each geometry for its first set
     bijectors = [*before, *(own for geometry in geometries for own in geometry.bijectors)]
@@ -79,7 +79,7 @@ def constrain_env(
         return published.append_transform(ConstraintAnchor(ordered))
     if ordered != bijectors:
         raise ValueError(
-            f"order: expected the constraints published before, {[each.name for each in before]}, "
+            f"order: expected the constraints published before, {[g.name for g in before]}, "
             f"to come first where there is no anchor, given {list(order or ())}; pass all "
             "geometries to one constrain_env, or leave with_anchor as it is"
         )

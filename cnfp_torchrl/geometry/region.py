@@ -96,7 +96,7 @@ class Region:
     @property
     def shape(self) -> torch.Size:
         """The shape ``(*batch, d)`` of the actions."""
-        others = [each.shape[:-1] for each in (self._anchor, self.active) if each is not None]
+        others = [value.shape[:-1] for value in (self._anchor, self.active) if value is not None]
         sets = (constraint_set.batch_shape for constraint_set in self.sets)
         return torch.Size((*broadcast_shape(*others, *sets), self.bounds.dim))
 
@@ -141,7 +141,7 @@ class Region:
         """
         shape = self.shape[:-1]
         if self.relaxation is not None:
-            largest = [each.amax(-1).expand(shape) for each in self.relaxation]
+            largest = [amounts.amax(-1).expand(shape) for amounts in self.relaxation]
             return torch.stack(largest, -1)
         if self.active is None:
             return self.bounds.low.new_zeros(*shape, len(self.sets))

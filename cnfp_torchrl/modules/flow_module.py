@@ -185,7 +185,9 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
             return self.flow(self._region(tensordict).to(self.action_dtype))
         sets: list[ConstraintSet] = [self._bounds_beside(tensordict)]
         if self.flow.reads_constraints:
-            sets += (each.get_set(tensordict).to(self.action_dtype) for each in self.bijectors)
+            sets += (
+                bijector.get_set(tensordict).to(self.action_dtype) for bijector in self.bijectors
+            )
         return self.flow(Region(sets, validate_args=False))
 
     def get_region(self, tensordict: TensorDictBase) -> Region:

@@ -166,7 +166,9 @@ class RecessionFlow(Flow):
         bounds, *others = sets
         assert isinstance(bounds, Box)
         unbounded = bool((bounds.low.isinf() & bounds.high.isinf()).all())
-        return not (unbounded and all(isinstance(each, HalfSpaces) for each in others))
+        return not (
+            unbounded and all(isinstance(constraint_set, HalfSpaces) for constraint_set in others)
+        )
 
     def _recession(self, region: Region, *, of_latents: bool) -> Recession:
         return Recession(
@@ -219,8 +221,9 @@ class ProjectionFlow(RegionFlow):
 
     As OptLayer (Pham et al., arXiv 1709.07643) and safety layers (Dalal et al. 2018, arXiv
     1801.08757) do. It is no bijection, so that no densities exist
-    (`cnfp_torchrl.bijectors.Projection`). For boxes, balls and half-spaces; onto a box with one
-    ball it is exact.
+    (`cnfp_torchrl.bijectors.Projection`). It takes all families that come with the library. Onto a
+    box with one ball, weighted L1 ball or positive part it is exact, also where a box, a ball or a
+    half-space stands alone.
 
     Args:
         rounds: The number of rounds of Dykstra's algorithm, for other intersections; actions that
@@ -268,7 +271,7 @@ def resolve_safe_flow(flow: Flow | str) -> Flow:
     """
     resolved = resolve_flow(flow)
     if not resolved.is_safe:
-        safe = [name for name, each in FLOWS.items() if each.is_safe]
+        safe = [name for name, flow in FLOWS.items() if flow.is_safe]
         raise ValueError(
             f"flow: expected one that guarantees the constraints, such as {safe}, given "
             f"{type(resolved).__name__}"

@@ -45,15 +45,17 @@ def refuse_violations(names: Sequence[str], region: Region, action: Tensor) -> N
     refuse_other_batch("action", action, region.anchor.shape[:-1])
     if bool(region.contains(action).all()):
         return
-    for stage, (name, each) in enumerate(zip(["bounds", *names], region.widened(), strict=True)):
-        bad = ~each.contains(action)
+    for stage, (name, constraint_set) in enumerate(
+        zip(["bounds", *names], region.widened(), strict=True)
+    ):
+        bad = ~constraint_set.contains(action)
         counts = region.counts(stage)
         if counts is not None:
             bad = bad & counts
         if bool(bad.any()):
             index = tuple(int(i) for i in bad.nonzero()[0])
             # In float64, as `contains`: in float32 the slack may round to 0.
-            exact = each.to(torch.float64)
+            exact = constraint_set.to(torch.float64)
             slack = exact.slack(action.double())[index].item()
             amount = _relaxation(region, stage, index)
             relaxed = f" widened by {amount:.3g}, as it is relaxed there" if amount else ""

@@ -70,17 +70,18 @@ def publishes_constraints(env: EnvBase) -> bool:
     """Tell whether an environment's own transforms publish any constraint."""
     publishers = (t for t in appended_transforms(env) if isinstance(t, ConstraintPublisher))
     # An anchor alone publishes none.
-    return any(not each.states_order or each.bijectors for each in publishers)
+    return any(not p.states_order or p.bijectors for p in publishers)
 
 
 def changed_actions(env: EnvBase) -> str | None:
     """Return the name of a transform that changes actions behind a `ConstraintAnchor`, or None."""
     transforms = iter(appended_transforms(env))
-    if not any(isinstance(each, ConstraintPublisher) and each.states_order for each in transforms):
+    if not any(isinstance(t, ConstraintPublisher) and t.states_order for t in transforms):
         return None
-    for each in transforms:
-        if env.action_key in each.in_keys_inv and not isinstance(each, DTypeCastTransform):
-            return type(each).__name__
+    for transform in transforms:
+        casts = isinstance(transform, DTypeCastTransform)
+        if env.action_key in transform.in_keys_inv and not casts:
+            return type(transform).__name__
     return None
 
 

@@ -55,7 +55,7 @@ def check_flow_stays_inside(example: Example) -> None:
     """Saturated samples of an exact flow lie in the set, with zero tolerance."""
     for dtype in DTYPES:
         bounds, sets = example.cast(dtype)
-        for rays in (each.cast(dtype) for each in example.rays):
+        for rays in (drawn.cast(dtype) for drawn in example.rays):
             region = Region((bounds, sets), rays.anchor)
             inner = region.eroded()
             gauge = inner.outer_and_inner_gauge(rays.directions)[1]

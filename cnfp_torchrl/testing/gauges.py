@@ -43,7 +43,7 @@ def check_gauge_is_homogeneous(example: Example) -> None:
     """``gauge(t v) = t gauge(v)`` for t > 0, also where t v is short."""
     for dtype in DTYPES:
         sets = example.cast(dtype)[1]
-        for rays in (each.cast(dtype) for each in example.rays):
+        for rays in (drawn.cast(dtype) for drawn in example.rays):
             gauge = sets.gauge(rays.directions, rays.anchor)
             for scale in (_SHORTEST, 2.0**-12, 2.0**10):
                 ratio = sets.gauge(rays.directions * scale, rays.anchor) / (scale * gauge)
@@ -58,7 +58,7 @@ def check_gauge_about(example: Example) -> None:
     """`gauge_about` gives what `gauge` gives."""
     for dtype in DTYPES:
         sets = example.cast(dtype)[1]
-        for rays in (each.cast(dtype) for each in example.rays):
+        for rays in (drawn.cast(dtype) for drawn in example.rays):
             gauge, about = sets.gauge(rays.directions, rays.anchor), sets.gauge_about(rays.anchor)
             error = (about(rays.directions) - gauge).abs()
             same = error <= 1e-4 * gauge + 1e-6
@@ -95,7 +95,7 @@ def check_gauge_gradient_is_finite(example: Example) -> None:
     """Gradients in direction and anchor are finite, also at kinks and in short directions."""
     for dtype in DTYPES:
         sets = example.cast(dtype)[1]
-        for rays in (each.cast(dtype) for each in example.rays):
+        for rays in (drawn.cast(dtype) for drawn in example.rays):
             for scale in (1.0, _SHORTEST):
                 directions = (scale * rays.directions).requires_grad_()
                 anchor = rays.anchor.expand(directions.shape).clone().requires_grad_()

@@ -145,7 +145,7 @@ def _sizes(env: TransformedEnv) -> tuple[int, int]:
     """
     spec = env.observation_spec.get(OBSERVATION_KEY, None)
     if spec is None or spec.ndim != len(env.batch_size) + 1 or not spec.dtype.is_floating_point:
-        kinds = {str(key): tuple(each.shape) for key, each in env.observation_spec.items()}
+        kinds = {str(key): tuple(spec.shape) for key, spec in env.observation_spec.items()}
         raise ValueError(
             f"env.base: expected an environment that publishes a vector of floating numbers at "
             f"{OBSERVATION_KEY!r}, given one that publishes {kinds}; concatenate what the networks "

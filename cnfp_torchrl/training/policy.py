@@ -52,10 +52,12 @@ class TrainedPolicy:
         self._mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         published = appended_transforms(env) if flow.reads_constraints else []
         self._publishers: list[Any] = [
-            each for each in published if isinstance(each, ConstraintPublisher)
+            publisher for publisher in published if isinstance(publisher, ConstraintPublisher)
         ]
-        read = [each for each in self._publishers if isinstance(each, GeometryTransform)]
-        keys = [*(key for each in read for key in each.in_keys), *actor.in_keys]
+        read = [
+            transform for transform in self._publishers if isinstance(transform, GeometryTransform)
+        ]
+        keys = [*(key for transform in read for key in transform.in_keys), *actor.in_keys]
         self.in_keys: list[NestedKey] = list(dict.fromkeys(filter(_is_observed, keys)))
         """The keys of what has to be observed: by networks, and by the constraints' geometry."""
         spec = env.observation_spec

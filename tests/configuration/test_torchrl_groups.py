@@ -1,6 +1,9 @@
 """Our parts in TorchRL's groups of configurations, and its own trainer that trains with them."""
 
+from copy import deepcopy
 from dataclasses import fields
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,6 +12,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
@@ -16,7 +20,6 @@ from tensordict import TensorDict
 from cnfp_torchrl.envs import ActionGuard, ConstrainedActions, appended_transforms
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.objectives import ConstrainedSACLoss
-from tests.torchrl_store import registered
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
 OURS = {
@@ -26,6 +29,24 @@ OURS = {
     "loss": ["constrained_sac"],
     "logger": ["rerun"],
 }
+
+
+@cache
+def registered() -> tuple[ModuleType, Any]:
+    """Return our module of groups, and a store with TorchRL's groups and ours.
+
+    They register themselves when they are imported, which takes seconds. Hydra's own store stays as
+    it was: commands that are composed later in the same process would be checked against groups of
+    TorchRL's that have the names of ours.
+    """
+    Plugins.instance()  # registers Hydra's own, once a process
+    store = ConfigStore.instance()
+    before = deepcopy(store.repo)
+    try:
+        import_module("torchrl.trainers.algorithms.configs")
+        return import_module("cnfp_torchrl.configuration.torchrl_groups"), store.repo
+    finally:
+        store.repo = before
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +82,7 @@ def test_transforms_are_made_and_fields_are_arguments(groups: ModuleType) -> Non
         (groups.ConstrainedActionsConfig(unbounded=True), ConstrainedActions),
     ):
         assert isinstance(instantiate(OmegaConf.structured(node)), made)
-        assert {each.name for each in fields(node)} - {"_target_"}
+        assert {field.name for field in fields(node)} - {"_target_"}
 
 
 # Of TorchRL's trainers themselves.
@@ -73,7 +94,7 @@ def test_torchrls_trainer_trains_within_the_constraints() -> None:
     trainer = instantiate(config.trainer)
     assert isinstance(trainer.loss_module, ConstrainedSACLoss)
     env = trainer.collector.env
-    assert any(isinstance(each, ActionGuard) for each in appended_transforms(env))
+    assert any(isinstance(transform, ActionGuard) for transform in appended_transforms(env))
     acting = trainer.collector.policy
     assert flow_head(acting).order == ["battery", "obstacle"]
     first = TensorDict.from_module(acting).data.clone()

@@ -19,7 +19,8 @@ from cnfp_torchrl.deploy import (
     self_test,
 )
 from cnfp_torchrl.deploy.self_test import latencies, with_noise
-from tests.deploy.conftest import actor_for, of_family
+from experiments.exported import DIMENSIONS, policy_of
+from tests.deploy.conftest import actor_for
 
 WITHOUT_TORCH = """
 import json, sys
@@ -107,29 +108,9 @@ def test_every_format(to: str, env: TransformedEnv, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @COMPILERS
-@pytest.mark.parametrize(
-    ("name", "dim"),
-    [
-        ("box", 6),
-        ("half-box", 2),
-        ("ball", 6),
-        ("huge-ball", 2),
-        ("ellipsoid", 2),
-        ("thin-ellipsoid", 6),
-        ("half-space", 2),
-        ("polytope", 6),
-        ("l1-ball", 6),
-        ("l1-ball-with-zeros", 2),
-        ("positive-part", 6),
-        ("task-space-ball", 2),
-        ("ball-of-components", 6),
-        ("visible", 2),
-        ("sight-or-box", 2),
-        ("zero-rows", 2),
-    ],
-)
-def test_every_family_in_onnxruntime(name: str, dim: int, tmp_path: Path) -> None:
-    policy, inputs = of_family(name, dim, 100_000, steps=2)
+@pytest.mark.parametrize("name", DIMENSIONS)
+def test_every_family_in_onnxruntime(name: str, tmp_path: Path) -> None:
+    policy, inputs = policy_of(name, 100_000)
     export_policy(policy, tmp_path)
     found = self_test(policy, open_exported(tmp_path), inputs)
     assert found["states"] == 100_000

@@ -12,8 +12,8 @@ from cnfp_torchrl.geometry import attempt_anchor
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.networks import gaussian_network
-from tests.deploy.conftest import actor_for, of_family, point_nav
-from tests.geometry.cases import FAMILIES
+from experiments.exported import DIMENSIONS, policy_of
+from tests.deploy.conftest import actor_for, point_nav
 
 
 def test_it_acts_as_the_actor_does(env: TransformedEnv) -> None:
@@ -56,11 +56,9 @@ def test_self_test_counts(env: TransformedEnv) -> None:
     assert found["largest_difference"] > 4
 
 
-@pytest.mark.parametrize(
-    ("name", "dim"), [(n, max(d for d in dims if d <= 6)) for n, (_, dims) in FAMILIES.items()]
-)
-def test_certified_actions_of_every_family_are_inside(name: str, dim: int) -> None:
-    policy, inputs = of_family(name, dim, 500)
+@pytest.mark.parametrize("name", DIMENSIONS)
+def test_certified_actions_of_every_family_are_inside(name: str) -> None:
+    policy, inputs = policy_of(name, 500)
     found = self_test(policy, policy, inputs)
     assert found["violations"] == found["fallback_out_of_bounds"] == 0
     assert found["certified"] > 0.25 * found["states"]

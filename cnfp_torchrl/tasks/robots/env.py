@@ -108,7 +108,7 @@ class RobotEnv(EnvBase):
             shape = (*batch, len(self.judges))
             self.observation_spec["cost"] = Bounded(0.0, 1.0, shape, dtype=torch.float32)
         low, high = (
-            torch.from_numpy(each).expand(*batch, -1) for each in (actions.low, actions.high)
+            torch.from_numpy(bound).expand(*batch, -1) for bound in (actions.low, actions.high)
         )
         self.action_spec = Bounded(low, high, dtype=torch.float32)
         self.reward_spec = Unbounded((*batch, 1), dtype=torch.float32)
@@ -152,7 +152,8 @@ class RobotEnv(EnvBase):
             self._shown[index], reward, *ends, _ = robot.step(actions[index])
             outcomes.append((float(reward), *ends))
         rewards, terminated, truncated = (
-            torch.tensor(each).reshape(*self.batch_size, 1) for each in zip(*outcomes, strict=True)
+            torch.tensor(outcome).reshape(*self.batch_size, 1)
+            for outcome in zip(*outcomes, strict=True)
         )
         flags = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         return self._output(cost, {"reward": rewards, **flags})
@@ -174,8 +175,8 @@ class RobotEnv(EnvBase):
             "qvel": np.stack([data.qvel for data in datas]),
         }
         return {
-            key: torch.from_numpy(each).reshape(*self.batch_size, -1)
-            for key, each in columns.items()
+            key: torch.from_numpy(value).reshape(*self.batch_size, -1)
+            for key, value in columns.items()
         }
 
 
