@@ -65,8 +65,8 @@ class HostReads(TorchDispatchMode):
     ) -> Any:
         name = func._schema.name
         masked = name.startswith("aten::index") and any(
-            isinstance(each, Tensor) and each.dtype == torch.bool
-            for each in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
+            isinstance(argument, Tensor) and argument.dtype == torch.bool
+            for argument in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
         )
         if name in _WAITS or masked:
             self._count(name)

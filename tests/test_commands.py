@@ -88,6 +88,8 @@ def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
         ("cnfp-train", ["flow=perfect"], "exact"),
         ("cnfp-train", ["env.order=[battery,wind]"], "wind"),
         ("cnfp-train", ["nonsense=1"], "nonsense"),
+        ("cnfp-train", ["figures._target_=gone.draw"], "figures: expected gone.draw to be"),
+        ("cnfp-train", ["visual=spawn"], "visual=spawn: expected a display"),
         ("cnfp-train", ["experiment=lagrangain"], "lagrangian_threshold"),
         ("cnfp-train", ["collector.total_frames=-3"], "collector.total_frames: expected a whole"),
         ("cnfp-audit", ["audit.states=many"], "audit.states: expected a whole number >= 1"),
@@ -101,6 +103,9 @@ def test_wrong_input_is_explained(
     done = run(tmp_path, command, *arguments)
     assert done.returncode != 0
     assert message in done.stderr
+    # Nothing before the cause, and no traceback behind it.
+    assert message in done.stderr.partition("\n")[0] or "Available options" in done.stderr
+    assert "Traceback" not in done.stderr
     assert not list(tmp_path.rglob("checkpoint.pt"))
 
 

@@ -55,6 +55,12 @@ def test_every_main_configuration_composes(name: str) -> None:
     assert composed(name=name)
 
 
+@pytest.mark.parametrize("loss", ["sac", "sac_lagrangian"])
+def test_the_target_entropy_is_the_task_s_or_that_of_the_action_bounds(loss: str) -> None:
+    assert composed(f"loss={loss}", "env.target_entropy=-3.0").loss.target_entropy == -3
+    assert composed(f"loss={loss}", "~env.target_entropy").loss.target_entropy == "auto"
+
+
 def test_an_unknown_experiment_is_refused_with_the_choices() -> None:
     with pytest.raises(MissingConfigException, match=r"(?s)lagrangain.*lagrangian"):
         composed("experiment=lagrangain")

@@ -125,14 +125,14 @@ def synchronizations(call: Callable[[], object]) -> int:
             call()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(each.message) for each in caught)
+    return sum("synchroniz" in str(warning.message) for warning in caught)
 
 
 @pytest.mark.parametrize("impossible", [False, True])
 def test_anchors_and_amounts_are_those_of_the_cpu(impossible: bool) -> None:
     sets = random_sets(512, impossible=impossible)
     here = Region.build(sets)
-    there = Region.build([each.to(device="cuda") for each in sets])
+    there = Region.build([constraint_set.to(device="cuda") for constraint_set in sets])
     assert there.anchor.is_cuda
     assert torch.equal(there.is_active.cpu(), here.is_active)
     assert bool((~here.is_active).any()) == impossible
@@ -169,7 +169,10 @@ def test_float32_on_the_gpu_agrees_with_float64_on_the_cpu(name: str) -> None:
 @pytest.mark.parametrize("name", SQUASHES)
 def test_no_float32_action_with_tf32_violates_anything(name: str, impossible: bool) -> None:
     batch = 20_000
-    sets = [each.to(torch.float32, "cuda") for each in random_sets(batch, impossible=impossible)]
+    sets = [
+        constraint_set.to(torch.float32, "cuda")
+        for constraint_set in random_sets(batch, impossible=impossible)
+    ]
     with tf32():
         region = Region.build(sets)
         bijector = SQUASHES[name](region)

@@ -74,7 +74,7 @@ def test_density_integrates_to_one_in_the_plane(case: Case) -> None:
 @pytest.mark.parametrize("case", LINE, **ids)
 def test_density_integrates_to_one_on_the_line(case: Case) -> None:
     """By Gauss's rule, on both sides of the anchor, where the density may jump."""
-    boxes = [each.bounding_box() for each in case.sets]
+    boxes = [constraint_set.bounding_box() for constraint_set in case.sets]
     low = torch.stack([box.low for box in boxes]).amax(0)
     high = torch.stack([box.high for box in boxes]).amin(0)
     anchor = (low + high) / 2 if case.anchor is None else case.anchor
@@ -266,7 +266,7 @@ LOOSE = {
 def test_equals_tanh_normal_where_nothing_binds(name: str, dtype: torch.dtype) -> None:
     """Values, scores and gradients, up to the erosion of 16 units of rounding error."""
     sets, active = LOOSE[name]
-    sets = tuple(cast(each, dtype) for each in (Box(LOW, HIGH), *sets))
+    sets = tuple(cast(constraint_set, dtype) for constraint_set in (Box(LOW, HIGH), *sets))
     bijector = GaugeSquash(Region(sets, tensor(0.1, 0.3, -0.4).to(dtype), active))
     eroded = 32 * torch.finfo(dtype).eps * 3
     results = []

@@ -40,8 +40,8 @@ def test_the_face_has_what_most_users_need_and_nothing_else() -> None:
 
     families = {
         name
-        for name, each in vars(geometry).items()
-        if isinstance(each, type) and issubclass(each, geometry.ConstraintSet)
+        for name, value in vars(geometry).items()
+        if isinstance(value, type) and issubclass(value, geometry.ConstraintSet)
     }
     assert {"Ball", "Box", "HalfSpaces", "WeightedL1Ball"} <= families & public
     for name in public:

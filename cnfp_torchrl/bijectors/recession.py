@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 from torch.nn.functional import softplus
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, log_det_zero, stacked
@@ -46,7 +47,9 @@ class Recession(Bijector):
 
     The slope vanishes like :math:`e^{-need/s}` beyond the rows, so that the inverse is right to
     rounding for actions whose slack in all rows is some hundred rounding errors, and may be
-    infinite or NaN closer to a row (`contains` is false).
+    infinite or NaN closer to a row (`contains` is false). What it finds becomes the same action
+    again, up to some d + 8 rounding errors of the wished action times :math:`1 + 1/\rho`, where
+    :math:`\rho = \min_k -A_k r` for rows of length 1.
 
     A region with an anchor may have finite bounds and further sets: the recession comes first, then
     a soft retraction along rays (`SoftRetraction`) of their intersection onto that with the rest.
@@ -108,6 +111,8 @@ class Recession(Bijector):
         return self._given.shape
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        if self._half_width is None:
+            return self._forward(latent, self._rows, self._rest)
         wished, log_det = self._in_action_units(latent)
         action, change = self._forward(wished, self._rows, self._rest)
         return action, log_det + change
@@ -154,10 +159,11 @@ class Recession(Bijector):
     def _forward(
         self, wished: Tensor, rows: _Rows | None, rest: SoftContraction | None
     ) -> tuple[Tensor, Tensor]:
-        point, log_det = wished, log_det_zero(wished)
-        if rows is not None:
-            point, softened = rows.forward(wished, self._scale)
-            log_det = -softened
+        if rows is None:
+            point, log_det = wished, log_det_zero(wished)
+        else:
+            point, moved = rows.forward(wished, self._scale)
+            log_det = -moved
         if rest is None:
             return point, log_det
         offset = point - self.region.anchor
@@ -175,7 +181,7 @@ class Recession(Bijector):
         if not chosen:
             return None
         magnitude = None if self._is_alone else self._given.bounds.magnitude()
-        return _Rows.of(chosen, self._way_out, magnitude, self._is_alone)
+        return _Rows.of(chosen, self._way_out, magnitude)
 
     def _rest_of(self, count: int, rows: _Rows | None) -> SoftContraction | None:
         """Return the retraction from the rows' intersection onto the first sets."""
@@ -183,7 +189,7 @@ class Recession(Bijector):
             return None
         anchor = self.region.anchor
         # All along rays, also without rows: a set that is dropped must be as if it were not there.
-        outer = None if rows is None else rows.eroded().gauge_about(anchor)
+        outer = None if rows is None else rows.half_spaces().gauge_about(anchor)
         return SoftContraction(outer, [], self.region.sets[:count], anchor, self._sharpness)
 
     def _refuse_other_sets(self, region: Region) -> None:
@@ -218,23 +224,29 @@ class Recession(Bijector):
 class _Rows(NamedTuple):
     """The rows of half-spaces, and a common way out of them.
 
+    Rounding is made up for twice: rows are eroded by that of the wished action, and the way is
+    longer by that of its own length. That of an offset is smaller: only a row that is no further
+    away than the action can be broken.
+
     Args:
-        normals: outward normals, ``(*batch, m, d)``.
-        offsets: offsets, ``(*batch, m)``; infinite for rows that do not count.
-        way_out: unit vectors r, ``(*batch, d)``.
+        normals: outward unit normals, ``(*batch, m, d)``.
+        offsets: offsets, ``(*batch, m)``; a large number for rows that do not count, since the
+            gradient of infinity would be NaN.
+        back: unit vectors -r, ``(*batch, d)``.
         rates: how fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
+        stretch: how much longer the way is than it must be, as a share, ``(*batch,)``; NaN where
+            there is no way out and no anchor either.
         has_way_out: where there is a way out, boolean ``(*batch,)``.
-        magnitude: the least size of actions to erode for, ``(*batch,)``; None is 0.
-        is_alone: whether actions are NaN where there is no way out, and not left as they are.
+        magnitude: the size of points that offsets are eroded for, ``(*batch, 1)``; None is 0.
     """
 
     normals: Tensor
     offsets: Tensor
-    way_out: Tensor
+    back: Tensor
     rates: Tensor
+    stretch: Tensor
     has_way_out: Tensor
     magnitude: Tensor | None
-    is_alone: bool
 
     @classmethod
     def of(
@@ -242,104 +254,121 @@ class _Rows(NamedTuple):
         sets: Sequence[tuple[HalfSpaces, Tensor | None]],
         way_out: Tensor | None,
         magnitude: Tensor | None,
-        is_alone: bool,
     ) -> _Rows:
-        """Return the rows of sets, each with where it is not dropped (None: everywhere)."""
-        normals, offsets = [], []
-        for each, counts in sets:
-            rows = each.superlevel()
-            bound = rows.offsets / rows.rates
-            if counts is not None:
-                bound = torch.where(counts.unsqueeze(-1), bound, torch.inf)
-            normals.append(rows.normals / rows.rates.unsqueeze(-1))
-            offsets.append(bound)
-        shape = broadcast_shape(*(n.shape[:-2] for n in normals), *(o.shape[:-1] for o in offsets))
-        normal = torch.cat([n.expand(*shape, *n.shape[-2:]) for n in normals], -2)
-        offset = torch.cat([o.expand(*shape, o.shape[-1]) for o in offsets], -1)
-        binds = offset < torch.inf
-        found = common_way_out(normal, binds) if way_out is None else way_out
-        length = torch.linalg.vector_norm(found, dim=-1, keepdim=True)
-        found = found / torch.where(length > 0, length, 1)
-        rates = -(normal * found.unsqueeze(-2)).sum(-1)
-        has_way_out = ((rates > LEAST_MARGIN) | ~binds).all(-1)
-        moves = binds & has_way_out.unsqueeze(-1)
-        return cls(
-            normal,
-            torch.where(moves, offset, torch.inf),
-            found,
-            torch.where(moves, rates, 1),
-            has_way_out,
-            magnitude,
-            is_alone,
-        )
+        """Return the rows of sets, each with where it is not dropped (None: everywhere).
 
-    def eroded(self) -> HalfSpaces:
-        """Return the half-spaces of the rows that move actions, eroded for the least size."""
-        assert self.magnitude is not None
-        sets = HalfSpaces(self.normals, self.offsets, validate_args=False)
-        return sets.eroded(self.magnitude)
+        Args:
+            sets: half-spaces.
+            way_out: vectors r of any length, ``(*batch, d)``; None finds one.
+            magnitude: the size of points, ``(*batch,)``. None is 0, for a region without an anchor,
+                where actions are NaN if there is no way out, and not left as they are.
+        """
+        normals, offsets = _unit_rows(sets)
+        info = torch.finfo(offsets.dtype)
+        far = info.max * LEAST_MARGIN**3
+        offsets = offsets.clamp(max=far)
+        binds = offsets < far
+        back = hull_point(normals, binds) if way_out is None else -way_out
+        back = back / vector_norm(back, dim=-1, keepdim=True).clamp(min=info.tiny)
+        rates = torch.where(binds, (normals * back.unsqueeze(-2)).sum(-1), 1)
+        least = rates.amin(-1)
+        has_way_out = least > LEAST_MARGIN
+        # A step along r is rounded in proportion to itself, which a row sees as a share of its
+        # rate.
+        stretch = EROSION_IN_EPS * info.eps * least.detach().reciprocal()
+        if magnitude is None:
+            stretch = torch.where(has_way_out, stretch, torch.nan)
+        else:
+            moves = has_way_out.unsqueeze(-1)
+            magnitude = magnitude.unsqueeze(-1)
+            offsets = torch.where(moves & binds, offsets - _erosion(normals) * magnitude, far)
+            rates = torch.where(moves, rates, 1)
+            stretch = torch.where(has_way_out, stretch, 0)
+        return cls(normals, offsets, back, rates, stretch, has_way_out, magnitude)
+
+    def half_spaces(self) -> HalfSpaces:
+        """Return the half-spaces, eroded for the magnitude."""
+        return HalfSpaces(self.normals, self.offsets, validate_args=False)
 
     def forward(self, wished: Tensor, scale: float) -> tuple[Tensor, Tensor]:
         """Return the actions, and softplus(need/s), ``(*batch,)``."""
-        with torch.no_grad():
-            moved = softened(self._need(wished, self._erosion(wished)) / scale)
-            erosion = self._erosion(wished, scale * moved)
-        moved = softened(self._need(wished, erosion) / scale)
+        moved = softened(self._need(wished, wished) / scale)
         return self._along(wished, scale * moved), moved
 
     def inverse(self, action: Tensor, scale: float) -> tuple[Tensor, Tensor]:
         """Return the wished actions, and softplus(need/s), ``(*batch,)``."""
         with torch.no_grad():
             # Erosion is that of the wished action, which is not known yet.
-            moved = _softened_of_left(-self._need(action, self._erosion(action)) / scale)
+            moved = _softened_of_left(-self._need(action, action) / scale)
             wished = self._along(action, -scale * moved)
             known = wished.isfinite().all(-1)
             wished = torch.where(known.unsqueeze(-1), wished, action)
-            erosion = self._erosion(wished, torch.where(known, scale * moved, 0))
-        moved = _softened_of_left(-self._need(action, erosion) / scale)
+            stretched = self.stretch * torch.where(known, scale * moved, 0)
+        moved = _softened_of_left(-(self._need(action, wished) + stretched) / scale)
         return self._along(action, -scale * moved), moved
 
-    def _need(self, point: Tensor, erosion: Tensor) -> Tensor:
-        """Return how far to go along the way out until all rows hold, negative if they do."""
-        beyond = (self.normals * point.unsqueeze(-2)).sum(-1) + erosion - self.offsets
-        # Rows that do not count need nothing: minus the largest number, not minus infinity.
-        lowest = torch.finfo(point.dtype).min / 4
-        return torch.where(self.offsets < torch.inf, beyond / self.rates, lowest).amax(-1)
+    def _need(self, point: Tensor, wished: Tensor) -> Tensor:
+        """Return how far to go along the way out until all rows hold, negative if they do.
 
-    def _erosion(self, point: Tensor, moved: Tensor | None = None) -> Tensor:
-        """Return the rounding error of each row at points and on their way out."""
-        size = point.detach().abs()
-        if moved is not None:
-            size = size + moved.detach().abs().unsqueeze(-1) * self.way_out.detach().abs()
+        Args:
+            point: points ``(*batch, d)``.
+            wished: the actions that rows are eroded for, ``(*batch, d)``.
+        """
+        size = wished.detach().abs().amax(-1, keepdim=True)
         if self.magnitude is not None:
-            size = torch.maximum(size, self.magnitude.unsqueeze(-1))
-        normals, offsets = self.normals.detach().abs(), self.offsets.detach()
-        offsets = torch.where(offsets < torch.inf, offsets, 0).abs()
-        total = (normals * size.unsqueeze(-2)).sum(-1) + offsets
-        return EROSION_IN_EPS * torch.finfo(point.dtype).eps * total
+            size = (size - self.magnitude).relu()
+        beyond = (self.normals * point.unsqueeze(-2)).sum(-1) - self.offsets
+        return (torch.add(beyond, size, alpha=_erosion(self.normals)) / self.rates).amax(-1)
 
     def _along(self, point: Tensor, way: Tensor) -> Tensor:
-        moved = torch.addcmul(point, way.unsqueeze(-1), self.way_out)
-        if not self.is_alone:
-            return moved
-        return torch.where(self.has_way_out.unsqueeze(-1), moved, torch.nan)
+        way = torch.addcmul(way, way.detach(), self.stretch)
+        return torch.addcmul(point, way.unsqueeze(-1), self.back, value=-1)
 
 
-def common_way_out(normals: Tensor, binds: Tensor) -> Tensor:
-    """Return directions that lead away from all rows, with the largest margin, ``(*batch, d)``.
+def _erosion(normals: Tensor) -> float:
+    """Return the rounding error of unit rows at points whose largest component is 1."""
+    dim: int = normals.shape[-1]
+    return EROSION_IN_EPS * torch.finfo(normals.dtype).eps * dim**0.5
 
-    Minus the point of least length in the convex hull of the normals. The exact one for up to two
-    rows; for more it is found in float64 in a fixed number of steps, and its gradient is that of
-    the rows that decide. Where the hull contains 0 there is none, and the result leads nowhere.
+
+def _unit_rows(sets: Sequence[tuple[HalfSpaces, Tensor | None]]) -> tuple[Tensor, Tensor]:
+    """Return unit normals ``(*batch, m, d)`` and offsets, infinite for rows that do not count."""
+    normals, offsets = [], []
+    for half_spaces, counts in sets:
+        normal, offset = half_spaces.normals, half_spaces.offsets
+        # Twice, so that no square underflows.
+        size = normal.detach().abs().amax(-1)
+        zero = size.logical_not()
+        size = size.masked_fill(zero, 1)
+        normal = normal / size.unsqueeze(-1)
+        length = vector_norm(normal, dim=-1).clamp(min=1)
+        offset = offset / size / length
+        passes = zero & (offset >= 0)
+        if counts is not None:
+            passes = passes | ~counts.unsqueeze(-1)
+        normals.append(normal / length.unsqueeze(-1))
+        offsets.append(offset.masked_fill(passes, torch.inf))
+    if len(sets) == 1 and normals[0].shape[:-1] == offsets[0].shape:
+        return normals[0], offsets[0]
+    shape = broadcast_shape(*(n.shape[:-2] for n in normals), *(o.shape[:-1] for o in offsets))
+    joined = torch.cat([n.expand(*shape, *n.shape[-2:]) for n in normals], -2)
+    return joined, torch.cat([o.expand(*shape, o.shape[-1]) for o in offsets], -1)
+
+
+def hull_point(normals: Tensor, binds: Tensor) -> Tensor:
+    """Return a multiple of the point of least length in the hull of unit normals, ``(*batch, d)``.
+
+    Its opposite leads away from all rows with the largest margin. It is exact for up to two rows;
+    for more it is found in float64 in a fixed number of steps, and its gradient is that of the rows
+    that decide. Where the hull contains 0 nothing leads away from all rows.
 
     Args:
         normals: unit normals, ``(*batch, m, d)``.
         binds: which rows count, boolean ``(*batch, m)``.
     """
-    counts = binds.to(normals.dtype)
     if normals.shape[-2] <= 2:
         # The point of least length between two unit vectors is their middle.
-        return -(normals * counts.unsqueeze(-1)).sum(-2)
+        return (normals * binds.unsqueeze(-1)).sum(-2)
     rows = normals.double() * binds.unsqueeze(-1)
     gram = rows @ rows.mT
     weights = _least_length_weights(gram.detach(), binds)
@@ -349,7 +378,7 @@ def common_way_out(normals: Tensor, binds: Tensor) -> Tensor:
     # A small multiple of the identity, for rows that are equal.
     system = torch.where(both, gram, 0) + identity * torch.where(deciding, 1e-13, 1.0).unsqueeze(-1)
     solved = torch.linalg.solve(system, deciding.double())
-    return -(rows * solved.unsqueeze(-1)).sum(-2).to(normals.dtype)
+    return (rows * solved.unsqueeze(-1)).sum(-2).to(normals.dtype)
 
 
 @torch.no_grad()

@@ -9,15 +9,13 @@ from pathlib import Path
 from cnfp_torchrl.commands.extras import needs_extra
 
 with needs_extra("train"):
-    import hydra
     from hydra.core.hydra_config import HydraConfig
     from hydra.utils import instantiate
     from omegaconf import DictConfig
 
     from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
-    from cnfp_torchrl.commands.paths import takes_any_path
-    from cnfp_torchrl.commands.refusals import told_in_a_sentence
-    from cnfp_torchrl.configuration import config_directory, require_settings
+    from cnfp_torchrl.commands.hydra_command import hydra_command
+    from cnfp_torchrl.configuration import require_settings
     from cnfp_torchrl.training.agent import build_environment, load_actor
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.whole_file import write_json
@@ -44,20 +42,18 @@ def audit_configured(config: DictConfig) -> AuditReport:
     )
 
 
-@takes_any_path
-@hydra.main(config_path=str(config_directory()), config_name="audit", version_base="1.3")
+@hydra_command("audit")
 def main(config: DictConfig) -> None:
     """Audit, print tables, write ``audit.json`` and ``audit.png``; exit with 3 for a flaw."""
-    with told_in_a_sentence():
-        report = audit_configured(config)
-        directory = Path(HydraConfig.get().runtime.output_dir)
-        write_json(directory / "audit.json", report.as_dict())
-        draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
-        if draw is not None:
-            draw(report, directory / "audit.png")
-        sys.stdout.write(f"{report}\n{directory}\n")
-        if report.flaws:
-            sys.exit(FLAWS_FOUND)
+    draw: Callable[[AuditReport, Path], Path] | None = instantiate(config.figure)
+    report = audit_configured(config)
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    write_json(directory / "audit.json", report.as_dict())
+    if draw is not None:
+        draw(report, directory / "audit.png")
+    sys.stdout.write(f"{report}\n{directory}\n")
+    if report.flaws:
+        sys.exit(FLAWS_FOUND)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,12 @@ from typing import Any
 from cnfp_torchrl.commands.extras import needs_extra
 
 with needs_extra("train"):
-    import hydra
     from hydra.core.hydra_config import HydraConfig
     from hydra.utils import instantiate
     from omegaconf import DictConfig
 
-    from cnfp_torchrl.commands.paths import takes_any_path
-    from cnfp_torchrl.commands.refusals import told_in_a_sentence
-    from cnfp_torchrl.configuration import config_directory, require_settings
+    from cnfp_torchrl.commands.hydra_command import hydra_command
+    from cnfp_torchrl.configuration import require_settings
     from cnfp_torchrl.text_table import text_table
     from cnfp_torchrl.training.callbacks import RECORDING, CallbackFactory, show_episodes
     from cnfp_torchrl.training.constraint_counts import count_text, gave_way_text
@@ -49,34 +47,32 @@ def _gave_way(reports: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
                 yield f"{policy}: {name} {text}"
 
 
-@takes_any_path
-@hydra.main(config_path=str(config_directory()), config_name="evaluate", version_base="1.3")
+@hydra_command("evaluate")
 def main(config: DictConfig) -> None:
     """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""
-    with told_in_a_sentence():
-        require_settings(config)
-        settings: EvaluationSettings = instantiate(config.evaluation)
-        visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
-        trusted = tuple(config.trusted)
-        folder = RunFolder.open(config.run, config.checkpoint)
-        directory = Path(HydraConfig.get().runtime.output_dir)
-        stream: AbstractContextManager[Any] = nullcontext()
-        if visual is not None:
-            recording = directory / RECORDING
-            stream = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
-        with stream:
-            reports = evaluate_run(folder, settings, trusted=trusted)
-            output = directory / "evaluation.json"
-            write_json(
-                output,
-                {
-                    "run": str(folder.path),
-                    "checkpoint": folder.checkpoint,
-                    "seed": settings.seed,
-                    "policies": reports,
-                },
-            )
-            sys.stdout.write(f"{evaluation_table(reports)}\n{output}\n")
+    require_settings(config)
+    settings: EvaluationSettings = instantiate(config.evaluation)
+    visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
+    trusted = tuple(config.trusted)
+    folder = RunFolder.open(config.run, config.checkpoint)
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    stream: AbstractContextManager[Any] = nullcontext()
+    if visual is not None:
+        recording = directory / RECORDING
+        stream = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
+    with stream:
+        reports = evaluate_run(folder, settings, trusted=trusted)
+        output = directory / "evaluation.json"
+        write_json(
+            output,
+            {
+                "run": str(folder.path),
+                "checkpoint": folder.checkpoint,
+                "seed": settings.seed,
+                "policies": reports,
+            },
+        )
+        sys.stdout.write(f"{evaluation_table(reports)}\n{output}\n")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ with needs_extra("train"):
     from hydra.utils import instantiate
     from tensordict import TensorDictBase
 
+    from cnfp_torchrl.commands.refusals import errors_in_a_sentence
     from cnfp_torchrl.keys import COST_KEY, OBSERVATION_KEY, REWARD_KEY
     from cnfp_torchrl.modules import flow_head
     from cnfp_torchrl.training.agent import build_environment, load_actor
@@ -124,10 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     given = parser.parse_args(arguments)
     options = vars(given)
-    try:
+    with errors_in_a_sentence(parser.prog, status=2):
         explanation = explain_run(RunFolder.open(options.pop("run")), **options)
-    except (ValueError, FileNotFoundError, PermissionError) as error:
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
     sys.stdout.write(explanation)
 
 

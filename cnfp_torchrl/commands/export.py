@@ -13,6 +13,7 @@ from cnfp_torchrl.commands.extras import needs_extra
 with needs_extra("train"):
     import torch
 
+    from cnfp_torchrl.commands.refusals import errors_in_a_sentence
     from cnfp_torchrl.deploy import FORMATS, DeployedPolicy, export_policy, open_exported
     from cnfp_torchrl.deploy.export import missing_packages, read_manifest, write_manifest
     from cnfp_torchrl.deploy.policy import STEPS
@@ -117,13 +118,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{parser.prog}: error: {' and '.join(missing)} not installed; install with: pip "
             "install 'cnfp_torchrl[export]'\n",
         )
-    try:
+    with errors_in_a_sentence(parser.prog, status=2):
         folder = RunFolder.open(options.pop("run"))
         output = Path(options.pop("output") or folder.path / "export")
         options["fallback"] = _numbers(options["fallback"])
         manifest = export_run(folder, output, **options)
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
     sys.stdout.write(report(manifest, output))
     if manifest["self_test"]["violations"]:
         sys.exit(3)

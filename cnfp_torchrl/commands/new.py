@@ -15,6 +15,7 @@ from cnfp_torchrl.commands.extras import needs_extra
 with needs_extra("train"):
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
+    from cnfp_torchrl.commands.refusals import errors_in_a_sentence
     from cnfp_torchrl.configuration import config_directory
 
 _TEMPLATE = Path(__file__).parent / "new_task"
@@ -107,10 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("name", help="of the task, a Python identifier such as my_task")
     name = parser.parse_args(arguments).name
-    try:
+    with errors_in_a_sentence(parser.prog, status=2):
         folder = new_task(name)
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
     files = "\n".join(str(folder / target.format(name=name)) for target in _FILES.values())
     sys.stdout.write(f"{files}\n{_next_steps(folder)}\n")
 

@@ -4,27 +4,11 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections.abc import Sequence
 from pathlib import Path
-from typing import ParamSpec, TypeVar
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 PATHS = ("run", "resume")
 """The keys whose values are paths."""
-
-
-def takes_any_path(command: Callable[P, R]) -> Callable[P, R]:
-    """Let a command of Hydra's take ``run=PATH`` and ``resume=PATH`` with any path."""
-
-    @wraps(command)
-    def with_quoted_paths(*args: P.args, **kwargs: P.kwargs) -> R:
-        sys.argv[1:] = quoted_paths(sys.argv[1:])
-        return command(*args, **kwargs)
-
-    return with_quoted_paths
 
 
 def quoted_paths(arguments: Sequence[str]) -> list[str]:

@@ -1,53 +1,104 @@
-"""What a command of Hydra's says when it refuses what it was given: a sentence, no traceback."""
+"""What a command says when it fails: the cause in one line, first, and a traceback only of bugs."""
 
 from __future__ import annotations
 
 import dis
+import os
 import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 
-from hydra.errors import CompactHydraException, InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from omegaconf import MissingMandatoryValue
-from omegaconf.errors import InterpolationResolutionError
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError
+
+WITH_TRACEBACKS = os.environ.get("HYDRA_FULL_ERROR") == "1"
+"""Whether the user asks for tracebacks, in Hydra's way."""
 
 
 @contextmanager
-def told_in_a_sentence() -> Iterator[None]:
-    """Let Hydra print this package's refusals without a traceback, unless HYDRA_FULL_ERROR is set.
+def errors_in_a_sentence(command: str = "", *, status: int = 1) -> Iterator[None]:
+    """End the process with an error's cause in one line, unless HYDRA_FULL_ERROR is 1.
 
-    A refusal is a `ValueError`, `TypeError` or `OSError` that a raise statement of this package
-    raised, a target that cannot be built, of which Hydra hides the cause, or a value that is taken
-    from a setting that is not there. All other errors keep their traceback: nobody foresaw them, so
-    that the place matters.
+    Args:
+        command: The command's name, for the beginning of the line.
+        status: The exit code.
 
     Raises:
-        CompactHydraException: in place of a refusal, with its words.
+        SystemExit: in place of an error.
     """
-    # Not sys.exit, which would end a sweep with its first refused job.
     try:
         yield
-    except MissingMandatoryValue as error:
-        key = error.full_key
-        raise CompactHydraException(f"{key}: expected a value, given none; add {key}=...") from None
-    except InterpolationResolutionError as error:
+    except Exception as error:
+        if WITH_TRACEBACKS:
+            raise
+        write_error(error, f"{command}: error: " if command else "")
+        sys.exit(status)
+
+
+def write_error(error: Exception, prefix: str = "") -> str:
+    """Write an error's cause to the standard error, and return it.
+
+    A refusal is written without a traceback. Any other error keeps its own below the cause: nobody
+    foresaw it, so that its origin matters.
+    """
+    sentence = refusal(error)
+    cause = type_and_origin(error) if sentence is None else sentence
+    sys.stderr.write(f"{prefix}{cause}\n")
+    if sentence is None:
+        sys.stderr.write("\n")
+        traceback.print_exception(error)
+    return cause
+
+
+def refusal(error: BaseException) -> str | None:
+    """Return the words of an error that says what the user may do, or None for any other error.
+
+    Such are the errors that a raise statement of this package raised, those of the operating system
+    about a file, those of Hydra and OmegaConf for a configuration that cannot be composed, and a
+    target that cannot be built, of which Hydra hides the cause.
+    """
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: expected a value, given none; add {error.full_key}=..."
+    if isinstance(error, InterpolationResolutionError):
         first = str(error).partition("\n")[0]
-        raise CompactHydraException(
+        return (
             f"{error.full_key}: its value is taken from a setting that is not there: {first}; give "
             f"{error.full_key}=..., or the setting"
-        ) from None
-    except InstantiationException as error:
-        raise CompactHydraException(_why_not_built(error)) from error
-    except (ValueError, TypeError, OSError) as error:
-        if not _raised_by_this_package(error):
-            raise
-        raise CompactHydraException(_words(error)) from error
+        )
+    if isinstance(error, InstantiationException):
+        return _why_not_built(error)
+    if isinstance(error, HydraException):
+        unknown = error.__cause__
+        if isinstance(unknown, ConfigAttributeError | ConfigKeyError):
+            return _unknown_setting(unknown)
+        return str(error)
+    if _raised_by_this_package(error):
+        return _words(error)
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return None
+
+
+def _unknown_setting(error: ConfigAttributeError | ConfigKeyError) -> str:
+    """Return which setting is not there, and which ones are."""
+    section, _, name = str(error.full_key).rpartition(".")
+    names = [str(key) for key in error.parent_node or () if key not in ("hydra", "_target_")]
+    close = get_close_matches(name, names)
+    examples = " or ".join(close) if close else f"one of {', '.join(names)}"
+    where = f"a setting of {section}" if section else "a setting"
+    return (
+        f"{error.full_key}: expected {where} that is there, such as {examples}; --cfg job prints "
+        f"them all, and +{error.full_key}=... adds one"
+    )
 
 
 def _words(error: BaseException) -> str:
-    return "\n".join([str(error), *getattr(error, "__notes__", [])])
+    # The text of a KeyError is that of its argument in quotation marks.
+    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    return "\n".join([text, *getattr(error, "__notes__", [])])
 
 
 def _why_not_built(error: InstantiationException) -> str:
@@ -71,10 +122,15 @@ def _why_not_built(error: InstantiationException) -> str:
         names = get_close_matches(missing, dir(sys.modules.get(parent)))
         hint = f"; there is {' and '.join(names)}" if names else ""
         return f"{begin}expected {target} to be importable, but {parent} has no {missing!r}{hint}"
-    # A syntax error names its place itself.
-    frames = [] if isinstance(cause, SyntaxError) else traceback.extract_tb(cause.__traceback__)
-    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"{begin}{target} cannot be built: {type(cause).__name__}: {_words(cause)}{place}"
+    return f"{begin}{target} cannot be built: {type_and_origin(cause)}"
+
+
+def type_and_origin(error: BaseException) -> str:
+    """Return an error's type, words, and the file and line that raised it."""
+    # A syntax error names its file itself.
+    frames = [] if isinstance(error, SyntaxError) else traceback.extract_tb(error.__traceback__)
+    origin = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {_words(error)}{origin}"
 
 
 def _raised_by_this_package(error: BaseException) -> bool:
@@ -82,7 +138,7 @@ def _raised_by_this_package(error: BaseException) -> bool:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    if trace is None:
+    if trace is None or type(error) is AssertionError:
         return False
     frame = trace.tb_frame
     module = str(frame.f_globals.get("__name__"))

@@ -15,6 +15,7 @@ from cnfp_torchrl.commands.extras import needs_extra
 
 with needs_extra("train"):
     from cnfp_torchrl.commands.paths import quoted
+    from cnfp_torchrl.commands.refusals import errors_in_a_sentence
     from cnfp_torchrl.commands.sweep_folders import config_arguments, planned_runs
     from cnfp_torchrl.text_table import text_table
     from cnfp_torchrl.training.run_folder import RunFolder
@@ -139,13 +140,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"--jobs: expected a number >= 1, given {options.jobs}")
-    try:
+    with errors_in_a_sentence(parser.prog):
         if options.resume:
             for line in resume(options.folder, jobs=options.jobs, trusted=options.trusted):
                 sys.stdout.write(f"{line}\n")
         sys.stdout.write(f"{report(options.folder)}\n")
-    except (OSError, ValueError) as error:
-        sys.exit(f"cnfp-sweep: {error}")
 
 
 if __name__ == "__main__":

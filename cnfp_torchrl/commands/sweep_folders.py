@@ -1,4 +1,4 @@
-"""Sweeps as Hydra starts them: how the runs' folders are called, and which sweeps were started."""
+"""The names of the runs' folders in sweeps that Hydra starts, and which sweeps were started."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STARTED: list[Path] = []
 
 
 class SweepStart(Callback):
-    """Remembers a sweep's folder, for what is told of it at the end, however that comes.
+    """Remembers a sweep's folder, for the table at its end, which also comes after a failure.
 
     Hydra itself calls nothing after a sweep with a failed run.
     """
@@ -44,7 +44,7 @@ def run_name(number: int, overrides: Sequence[str], constant: Sequence[str]) -> 
         overrides: all overrides of the run.
         constant: the keys that all runs have in common.
     """
-    varied = (each.lstrip("+~").partition("=") for each in overrides)
+    varied = (override.lstrip("+~").partition("=") for override in overrides)
     parts = [
         f"{re.split('[./@]', key)[-1]}-{_short(value)}"
         for key, _, value in varied
@@ -107,19 +107,22 @@ def config_arguments(folder: Path) -> list[str]:
     return [part for directory in given for part in ("--config-dir", directory)]
 
 
-def sweep_arguments(arguments: Sequence[str]) -> list[str]:
-    """Return what to add to the arguments of a sweep: the keys that all its runs have in common."""
+def with_common_keys(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of a command, those of a sweep with the keys that its runs share."""
     if not {"-m", "--multirun"} & set(arguments):
-        return []
-    constant = []
-    for argument in arguments:
+        return list(arguments)
+    common, behind = [], 0
+    for number, argument in enumerate(arguments, start=1):
         try:
             override = OverridesParser.create().parse_override(argument)
         except HydraException:
             continue  # an option, or what Hydra will refuse in its own words
         if not override.is_sweep_override() and not argument.startswith("hydra"):
-            constant.append(override.get_key_element().lstrip("+~"))
-    if not constant:
-        return []
-    quoted = ",".join(f"'{key}'" for key in constant)
-    return [f"hydra.job.config.override_dirname.exclude_keys=[{quoted}]"]
+            common.append(override.get_key_element().lstrip("+~"))
+            behind = number
+    if not common:
+        return list(arguments)
+    quoted = ",".join(f"'{key}'" for key in common)
+    excluded = f"hydra.job.config.override_dirname.exclude_keys=[{quoted}]"
+    # Beside another override: the parser of the command line takes them in one row alone.
+    return [*arguments[:behind], excluded, *arguments[behind:]]

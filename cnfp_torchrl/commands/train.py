@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,15 @@ from typing import Any
 from cnfp_torchrl.commands.extras import needs_extra
 
 with needs_extra("train"):
-    import hydra
     from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
     from hydra.utils import instantiate
     from omegaconf import DictConfig, OmegaConf
 
-    from cnfp_torchrl.commands.paths import takes_any_path
-    from cnfp_torchrl.commands.refusals import told_in_a_sentence
+    from cnfp_torchrl.commands.hydra_command import hydra_command, is_sweep
+    from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, write_error
     from cnfp_torchrl.commands.sweep import report
-    from cnfp_torchrl.commands.sweep_folders import STARTED, sweep_arguments
-    from cnfp_torchrl.configuration import config_directory, foreign_packages
+    from cnfp_torchrl.commands.sweep_folders import STARTED, with_common_keys
+    from cnfp_torchrl.configuration import foreign_packages
     from cnfp_torchrl.training.callbacks import RECORDING
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
@@ -118,40 +116,49 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
     return folder, config
 
 
-@hydra.main(config_path=str(config_directory()), config_name="train", version_base="1.3")
+@hydra_command("train")
 def _main(config: DictConfig) -> float:
     """Train, draw the run's figures, print the summary, and return what a sweep maximizes."""
-    with told_in_a_sentence():
-        is_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
-        folder, config = _folder_and_config(config)
-        # A sweep tells of its runs that were refused, also when they are tried again.
-        is_told = is_sweep or folder.load_failure() is not None
-        try:
-            summary = train(config, folder, resume=folder.has_started)
-        except TrainingInterrupted as stop:
-            sys.stderr.write(f"{stop}\n")
-            sys.exit(128 + stop.number)
-        except Exception as error:
-            # A complete run has not failed because it was asked to go on.
-            if (is_told or folder.has_started) and not folder.is_complete:
-                folder.save_failure(error)
+    folder, config = _folder_and_config(config)
+    # A sweep tells of its runs that were refused, also when they are tried again.
+    is_told = is_sweep() or folder.load_failure() is not None
+    try:
+        draw: Callable[[RunFolder], object] | None = instantiate(config.figures) or None
+        summary = train(config, folder, resume=folder.has_started)
+    except TrainingInterrupted as stop:
+        sys.stderr.write(f"{stop}\n")
+        sys.exit(128 + stop.number)
+    except Exception as error:
+        # A complete run has not failed because it was asked to go on.
+        if (is_told or folder.has_started) and not folder.is_complete:
+            folder.save_failure(error)
+        raise
+    finally:
+        if not is_told:
+            _remove_unless_started(folder)
+    folder.forget_failure()
+    sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
+    if not is_sweep():
+        sys.stdout.write(f"{_next_steps(folder, config)}\n")
+    sys.stdout.flush()
+    if draw is not None:
+        _draw_figures(draw, folder)
+    return _objective(summary)
+
+
+def _draw_figures(draw: Callable[[RunFolder], object], folder: RunFolder) -> None:
+    """Draw the figures of a run that is complete, whose score a sweep keeps without them, too."""
+    try:
+        draw(folder)
+    except Exception as error:
+        if not is_sweep() or WITH_TRACEBACKS:
             raise
-        finally:
-            if not is_told:
-                _remove_unless_started(folder)
-        folder.forget_failure()
-        if config.figures:
-            instantiate(config.figures)(folder)
-        sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")
-        if not is_sweep:
-            sys.stdout.write(f"{_next_steps(folder, config)}\n")
-        return _objective(summary)
+        write_error(error, f"{folder.path}: figures: ")
 
 
-@takes_any_path
 def main() -> None:
     """Train a run, or the runs of a sweep, of which a table is printed at the end."""
-    sys.argv += sweep_arguments(sys.argv[1:])
+    sys.argv[1:] = with_common_keys(sys.argv[1:])
     try:
         _main()
     finally:

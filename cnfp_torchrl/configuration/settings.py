@@ -70,7 +70,10 @@ RADIUS = Expected("a number > 0", lambda x: x == math.inf or POSITIVE.accepts(x)
 PORT = Expected("a port from 1 to 65535", lambda x: COUNT.accepts(x) and x <= 65535)
 ENTROPY = Expected("a finite number or 'auto'", lambda x: x == "auto" or _is_number(x))
 COUNTS = Expected("a list of whole numbers >= 1", _list_of(COUNT.accepts))
-COSTS = Expected("a list of finite numbers >= 0", _list_of(NOT_NEGATIVE.accepts))
+COSTS = Expected(
+    "a finite number >= 0, or a list of them",
+    lambda x: NOT_NEGATIVE.accepts(x) or _list_of(NOT_NEGATIVE.accepts)(x),
+)
 NAMES = Expected("a list of the constraints' names", _list_of(lambda x: isinstance(x, str)))
 PAIRS = Expected("a list of pairs such as [[0, 1]]", _list_of(lambda _: True))
 DEVICE = Expected(f"a device of this machine: {', '.join(_devices())}", _is_device)

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
+from cnfp_torchrl.deploy.notices import without_exporters_notices
 from cnfp_torchrl.deploy.operators import OperatorsOfOnnx
 from cnfp_torchrl.deploy.policy import DeployedPolicy
 from cnfp_torchrl.installed_versions import installed_versions
@@ -56,12 +57,13 @@ def export_policy(policy: DeployedPolicy, folder: str | Path, to: Format = "onnx
             f"folder: expected one without {held}, given {folder}; nothing is overwritten"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    if to == "onnx":
-        _write_onnx(policy, file)
-    elif to == "torch":
-        torch.export.save(_program(policy), file)
-    else:
-        torch._inductor.aoti_compile_and_package(_program(policy), package_path=str(file))
+    with without_exporters_notices():
+        if to == "onnx":
+            _write_onnx(policy, file)
+        elif to == "torch":
+            torch.export.save(_program(policy), file)
+        else:
+            torch._inductor.aoti_compile_and_package(_program(policy), package_path=str(file))
     write_manifest(folder, _manifest(policy, file, to))
     return file
 

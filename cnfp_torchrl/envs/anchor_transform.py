@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform, are_good
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
 from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, begin_anchor, finish_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
@@ -126,11 +126,12 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                 self._watch.all_held(batch.numel())
             else:
                 self._watch([bounds, *sets], found.largest(), batch.numel())
-        next_tensordict.set(ANCHOR_KEY, found.anchor.expand(*batch, bounds.dim))
+        next_tensordict.set(ANCHOR_KEY, _expanded(found.anchor, batch))
+        active = _expanded(found.active, batch).unbind(-1)
         for stage, bijector in enumerate(self._bijectors, start=1):
-            rows = found.relaxation[stage].expand(*batch, found.relaxation[stage].shape[-1])
+            rows = _expanded(found.relaxation[stage], batch)
             largest = rows.squeeze(-1) if rows.shape[-1] == 1 else rows.amax(-1)
-            next_tensordict.set(bijector.active_key, found.active[..., stage].expand(batch))
+            next_tensordict.set(bijector.active_key, active[stage])
             next_tensordict.set(bijector.relaxation_key, largest)
             if bijector.row_relaxation_key is not None:
                 next_tensordict.set(bijector.row_relaxation_key, rows)
@@ -143,16 +144,16 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         """
         if self._geometries is None:
             appended = appended_transforms(self.container)
-            before = takewhile(lambda each: each is not self, appended)
-            self._geometries = [
-                geometry for geometry in before if isinstance(geometry, GeometryTransform)
-            ]
-        checks = [check for geometry in self._geometries if (check := geometry.pending_check())]
-        good = torch.stack([decided, *(check.good for check in checks)]).tolist()
-        for check, is_good in zip(checks, good[1:], strict=True):
-            if not is_good:
+            before = takewhile(lambda transform: transform is not self, appended)
+            self._geometries = [t for t in before if isinstance(t, GeometryTransform)]
+        checks = [check for t in self._geometries if (check := t.pending_check())]
+        if not checks:
+            return bool(decided)
+        all_decided, good = torch.stack([decided, are_good(checks)]).tolist()
+        if not good:
+            for check in checks:
                 check.refuse()
-        return bool(good[0])
+        return bool(all_decided)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -242,3 +243,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
             self._bounds = ActionBounds(bounds)
         return self._bounds.on(device)
+
+
+def _expanded(value: Tensor, batch: torch.Size) -> Tensor:
+    """Return values ``(..., m)`` as ``(*batch, m)``."""
+    return value if value.shape[:-1] == batch else value.expand(*batch, value.shape[-1])

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torch.linalg import vector_norm
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
@@ -78,7 +76,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     _family: type[ConstraintSet] | None = None
     _is_compared = False
     _is_settled_by_another = False
-    _check: _Check | None = None
+    _check: Check | None = None
     _valid_shapes: list[tuple[torch.Size, torch.dtype]] | None = None
 
     def __init__(
@@ -149,8 +147,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             TypeError: when it is no `ConstraintSet`.
             GeometryError: for another family than before, and one that breaks the contract.
         """
-        with self._naming_the_constraint("constraint_set"):
-            allowed = self.constraint_set(tensordict)
+        allowed = self._own("constraint_set", self.constraint_set, tensordict)
         if type(allowed) is not self._family:
             self._refuse_what_is_no_set(allowed)
             self._family = type(allowed)
@@ -266,37 +263,30 @@ class GeometryTransform(Transform, ConstraintPublisher):
             next_tensordict.set(key, value)
         return next_tensordict
 
-    def pending_check(self) -> _Check | None:
+    def pending_check(self) -> Check | None:
         """Return the check of the last states for the caller to settle, as from now on each time.
 
         For a transform behind this one that settles the checks of several at once.
         """
         check, self._check = self._check, None
-        self._is_settled_by_another = True
+        if not self._is_settled_by_another:
+            self._is_settled_by_another = True
         return check
 
     def _check_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
-        inputs = (states.get(key) for key in self.in_keys)
-        good = [
-            vector_norm(value, torch.inf) < torch.inf
-            for value in inputs
-            if value.is_floating_point() and value.numel()
-        ]
+        inputs = [states.get(key) for key in self.in_keys]
         shapes = [(value.shape, value.dtype) for value in allowed.fields().values()]
         if shapes != self._valid_shapes:
             allowed.validate_shapes(self._where(allowed))
             self._valid_shapes = shapes
-        check = _Check(
-            torch.stack([*good, allowed.is_valid()]).all(),
-            partial(self._refuse_values, states, allowed),
-        )
+        check = Check(inputs, allowed, partial(self._refuse_values, states, allowed))
         if self._is_settled_by_another and self._check is None:
             self._check = check
             return
         # Nobody has settled the last one: whoever did is not behind this transform any more.
         left, self._check, self._is_settled_by_another = self._check, None, False
         for pending in (left, check):
-            if pending is not None and not bool(pending.good):
+            if pending is not None and not bool(are_good([pending])):
                 pending.refuse()
 
     def _refuse_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
@@ -321,16 +311,17 @@ class GeometryTransform(Transform, ConstraintPublisher):
         entries: dict[tuple[str, ...], Tensor] = {}
         for field, value in allowed.fields().items():
             event = value.shape[value.ndim - allowed.event_dims[field] :]
-            try:
-                expanded = value.expand((*batch, *event)).contiguous()
-            except RuntimeError:
-                raise GeometryError(
-                    f"constraint '{self.name}', field '{field}': expected a batch shape that "
-                    f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
-                ) from None
-            entries[field_key(self.name, field)] = expanded
-        with self._naming_the_constraint("safe_action"):
-            action = self.safe_action(tensordict, allowed)
+            shape = (*batch, *event)
+            if value.shape != shape:
+                try:
+                    value = value.expand(shape)
+                except RuntimeError:
+                    raise GeometryError(
+                        f"constraint '{self.name}', field '{field}': expected a batch shape that "
+                        f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
+                    ) from None
+            entries[field_key(self.name, field)] = value.contiguous()
+        action = self._own("safe_action", self.safe_action, tensordict, allowed)
         if action is not None:
             expected = (*batch, allowed.dim)
             _refuse_other_shape(f"{self._at('safe_action')}: expected None or", action, expected)
@@ -340,11 +331,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _at(self, method: str) -> str:
         return f"constraint '{self.name}', {type(self).__name__}.{method}"
 
-    @contextmanager
-    def _naming_the_constraint(self, method: str) -> Iterator[None]:
-        """Add the names of constraint and method to errors of a constraint's own code."""
+    def _own(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a constraint's own code; its errors get the names of constraint and method."""
         try:
-            yield
+            return call(*arguments)
         except AttributeError as error:
             # An environment would report the AttributeError itself as a missing spec.
             raise GeometryError(f"{self._at(method)}: AttributeError: {error}") from error
@@ -413,8 +403,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
         zeros = next(iter(allowed.fields().values())).new_zeros(*batch, allowed.dim)
         method = f"constraint_set, {type(allowed).__name__}.slack"
-        with self._naming_the_constraint(method):
-            slack = allowed.slack(zeros)
+        slack = self._own(method, allowed.slack, zeros)
         given = f"for actions {tuple(zeros.shape)} expected"
         _refuse_other_shape(f"{self._at(method)}: {given}", slack, batch)
 
@@ -430,11 +419,26 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 )
 
 
-class _Check(NamedTuple):
-    """Whether values are as they must be, boolean ``()``, and what raises if they are not."""
+class Check(NamedTuple):
+    """What is to be checked of some states: the values that were read and the set they led to."""
 
-    good: Tensor
+    inputs: list[Tensor]
+    allowed: ConstraintSet
     refuse: Callable[[], None]
+    """Raises if a value is not as it must be."""
+
+
+def are_good(checks: Sequence[Check]) -> Tensor:
+    """Tell whether all values are as they must be, boolean ``()``, without reading it."""
+    # What several constraints read is looked at once.
+    inputs = {id(value): value for check in checks for value in check.inputs}
+    sizes = [
+        value.abs().amax()
+        for value in inputs.values()
+        if value.is_floating_point() and value.numel()
+    ]
+    good = [size < torch.inf for size in sizes]
+    return torch.stack([*good, *(check.allowed.is_valid() for check in checks)]).all()
 
 
 def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> None:

@@ -30,7 +30,7 @@ from cnfp_torchrl.geometry.constraint_set import (
 )
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.norms import length, power_of_two
-from cnfp_torchrl.geometry.projection import project, project_onto_intersection
+from cnfp_torchrl.geometry.projection import project, project_onto_intersection, settled
 from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
@@ -75,5 +75,6 @@ __all__ = [
     "require_action_bounds",
     "row_depths",
     "scaled_direction",
+    "settled",
     "sides",
 ]

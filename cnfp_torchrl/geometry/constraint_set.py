@@ -11,7 +11,6 @@ from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.superlevel import Superlevel
 
@@ -228,6 +227,20 @@ class ConstraintSet(ABC):
         """
         return self.superlevel()
 
+    def parts_near(self, point: Tensor) -> Superlevel | None:
+        """Describe several convex parts, the one with the point closest to a point among them.
+
+        For the projection. Only non-convex families override this; None, the default, says that the
+        set is convex.
+
+        Args:
+            point: points ``(*batch, d)``.
+
+        Returns:
+            A description of batch shape ``(parts, *batch)``.
+        """
+        return None
+
     # What follows from it -------------------------------------------------------------------------
 
     def fields(self) -> dict[str, Tensor]:
@@ -243,7 +256,8 @@ class ConstraintSet(ABC):
     @property
     def dim(self) -> int:
         """The dimension d of the action space."""
-        return next(int(v.shape[-1]) for n, v in self.fields().items() if self.event_dims[n] > 0)
+        name = next(name for name, dims in self.event_dims.items() if dims > 0)
+        return int(getattr(self, name).shape[-1])
 
     @property
     def dtype(self) -> torch.dtype:
@@ -321,19 +335,16 @@ class ConstraintSet(ABC):
 
     def is_valid(self) -> Tensor:
         """Tell whether `validate` accepts the values, boolean ``()``, without reading them."""
-        most, good = largest_value(self.dtype), []
+        sizes = []
         for field, value in self.fields().items():
-            if value.numel() == 0:
-                continue
-            if field in self.finite_fields:
-                good.append(vector_norm(value, torch.inf) <= most)
-            else:
-                size = value.abs()
-                good.append(((size <= most) | (size == torch.inf)).all())
+            size = value.abs()
+            if field not in self.finite_fields:
+                size = size.nan_to_num(nan=torch.inf, posinf=0)
+            # Of no states, and NaN where a number is.
+            sizes.append(size.amax() if size.numel() else size.new_zeros(()))
+        good = torch.stack(sizes) <= largest_value(self.dtype)
         bad = [mask.any() for _, mask, _ in self.invalid_fields()]
-        like = next(iter(self.fields().values()))
-        good = good or [torch.ones((), dtype=torch.bool, device=like.device)]
-        return torch.stack([*good, *(~mask for mask in bad)]).all()
+        return torch.cat([good, ~torch.stack(bad)]).all() if bad else good.all()
 
     def validate_shapes(self, where: str) -> None:
         """Refuse fields of wrong types or shapes, without reading their values.

@@ -27,6 +27,9 @@ def length(vector: Tensor) -> Tensor:
     Args:
         vector: vectors ``(*batch, d)``.
     """
+    if vector.dtype == torch.float32:
+        # Squares of float32 are in range in float64, which takes fewer passes than a unit does.
+        return vector_norm(vector, dim=-1, dtype=torch.float64).to(vector.dtype)
     unit = power_of_two(vector.abs().amax(-1))
     return unit * vector_norm(vector / unit.unsqueeze(-1), dim=-1)
 

@@ -54,8 +54,8 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         qvalue_network: The critic, see `ConstrainedSACLoss`.
         cost_network: A critic that reads observation and action and writes ``state_action_cost``
             ``(*batch, K)``; best one that cannot be negative, as costs cannot.
-        thresholds: The bounds :math:`\epsilon_k \ge 0`, one for each constraint, in discounted
-            costs: a violation in every step is worth 1 / (1 - gamma_cost).
+        thresholds: The bounds :math:`\epsilon_k \ge 0`, one for each constraint or a number for
+            all, in discounted costs: a violation in every step is worth 1 / (1 - gamma_cost).
         constraint_names: The names of the columns of ``cost``, for the log; None numbers them.
         gamma_cost: The discount of costs, in [0, 1).
         lambda_init: The multipliers' first value, in (0, lambda_max].
@@ -88,7 +88,7 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         qvalue_network: TensorDictModule,
         cost_network: TensorDictModule,
         *,
-        thresholds: Sequence[float],
+        thresholds: float | Sequence[float],
         constraint_names: Sequence[str] | None = None,
         gamma_cost: float = 0.99,
         lambda_init: float = 1.0,
@@ -96,6 +96,10 @@ class SACLagrangianLoss(ConstrainedSACLoss):
         num_cost_nets: int = 1,
         **kwargs: Any,
     ) -> None:
+        if isinstance(thresholds, int | float):
+            thresholds = [thresholds] * len(
+                [None] if constraint_names is None else constraint_names
+            )
         limits = list(map(float, thresholds))
         names = list(map(str, range(len(limits))) if constraint_names is None else constraint_names)
         _require(

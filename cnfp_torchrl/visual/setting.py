@@ -164,6 +164,10 @@ class Setting:
         ends = tuple(zip(self.low, self.high, strict=True))
         return self.limits if self.leaves_bounds else ends
 
+    def axis_title(self, component: int) -> str:
+        """Return a component's name, unit and bounds."""
+        return axis_title(self.components[component], (self.low[component], self.high[component]))
+
     def rows(self) -> list[list[StageView]]:
         """Return the views, a row for each projection, stages from left to right."""
         rows = []
@@ -173,11 +177,6 @@ class Setting:
                 title = f"{index + 1} · {'action bounds' if name == 'bounds' else name}"
                 if index > 0 and index + 1 == len(self.stages):
                     title = f"{title}, highest priority"
-                arrows = [
-                    f"{arrow} {self.components[component].title}"
-                    for arrow, component in zip("→↑", components, strict=False)
-                ]
-                title = f"{title} ({', '.join(arrows)})"
                 row.append(StageView(index, tuple(components), title))
             rows.append(row)
         return rows
@@ -193,6 +192,12 @@ class Setting:
         axes = [low + (high - low) * share for low, high in self.support]
         # One component after the other in memory: to add up two neighbors takes thrice as long.
         return torch.stack(torch.meshgrid(*axes, indexing="xy")).movedim(0, -1)
+
+
+def axis_title(component: Component, limits: tuple[float, float]) -> str:
+    """Return what stands at an axis: a name, its unit, and the ends of the axis."""
+    low, high = limits
+    return f"{component.title}, {low:.3g} to {high:.3g}"
 
 
 def pair_name(components: Sequence[int]) -> str:

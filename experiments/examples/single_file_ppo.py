@@ -110,10 +110,10 @@ def update(
             running = surprise[time] + GAMMA * LAMBDA * running.masked_fill(over[time], 0)
             advantage[time] = running
     target = advantage + value
-    data = [each.flatten(0, 1) for each in (observation, action, log_prob, advantage, target)]
+    data = [values.flatten(0, 1) for values in (observation, action, log_prob, advantage, target)]
     for _ in range(EPOCHS):
         for rows in torch.randperm(len(data[0])).chunk(MINIBATCHES):
-            seen, acted, old, gain, wanted = (each[rows] for each in data)
+            seen, acted, old, gain, wanted = (value[rows] for value in data)
             policy = agent.policy(seen)
             ratio = (policy.log_prob(acted).sum(-1) - old).exp()
             gain = (gain - gain.mean()) / (gain.std() + 1e-8)

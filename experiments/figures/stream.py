@@ -89,7 +89,7 @@ def main() -> None:
     torch.manual_seed(0)
     with torch.no_grad():
         rollout = env.rollout(1000, actor)
-    episode, telling = most_telling(actor, [list(each.unbind(0)) for each in rollout])
+    episode, telling = most_telling(actor, [list(recorded.unbind(0)) for recorded in rollout])
 
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "episode.rrd"
@@ -120,7 +120,7 @@ def main() -> None:
 
     arguments.output.mkdir(parents=True, exist_ok=True)
     resized(pictures[telling], WIDTH).save(arguments.output / "stream.png", optimize=True)
-    film = [resized(each, FILM_WIDTH) for each in pictures.values()]
+    film = [resized(picture, FILM_WIDTH) for picture in pictures.values()]
     film[0].save(
         arguments.output / "stream.webp",
         save_all=True,

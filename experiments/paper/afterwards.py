@@ -79,7 +79,7 @@ def evaluate_afterwards(folder: RunFolder) -> dict[str, Evaluation]:
         folder: a finished run; its configuration says how many episodes, from which seed.
     """
     config = folder.load_config()
-    return {name: evaluation(folder, changed(config, each)) for name, each in CHANGES.items()}
+    return {name: evaluation(folder, changed(config, change)) for name, change in CHANGES.items()}
 
 
 def evaluation(folder: RunFolder, config: DictConfig) -> Evaluation:
@@ -100,8 +100,8 @@ def _layouts(content: Any) -> Iterator[dict[str, Any]]:
     if isinstance(content, dict):
         if content.get("_target_") == "cnfp_torchrl.tasks.point_nav.Layout":
             yield content
-        for each in content.values():
-            yield from _layouts(each)
+        for value in content.values():
+            yield from _layouts(value)
     elif isinstance(content, list):
-        for each in content:
-            yield from _layouts(each)
+        for value in content:
+            yield from _layouts(value)

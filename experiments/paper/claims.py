@@ -80,9 +80,9 @@ class Evidence:
         Raises:
             Untested: for a method without any.
         """
-        if lacking := [label(each).name for each in methods if not self.runs.get(each)]:
+        if lacking := [label(method).name for method in methods if not self.runs.get(method)]:
             raise Untested("no runs of " + ", ".join(lacking))
-        return {label(each).name: self.runs[each] for each in methods}
+        return {label(method).name: self.runs[method] for method in methods}
 
     def one(self, method: str) -> Runs:
         """Return the records of a method; raises `Untested` as `of` does."""
@@ -91,7 +91,7 @@ class Evidence:
 
     def baselines(self) -> dict[str, Runs]:
         """Return the records of every constrained baseline, there or required; see `of`."""
-        there = [each for each in self.runs if label(each).baseline]
+        there = [run for run in self.runs if label(run).baseline]
         return self.of(*dict.fromkeys((*BASELINES, *there)))
 
 
@@ -123,7 +123,9 @@ class Claim:
 def satisfaction(runs: Runs, yes: float = 0.0, partly: float = QUASI) -> Finding:
     """Judge the largest share of violating steps of any run, evaluations included."""
     counts = [run.violations for run in runs]
-    steps = [run.steps + sum(each.steps for each in run.evaluation.both) for run in runs]
+    steps = [
+        run.steps + sum(evaluation.steps for evaluation in run.evaluation.both) for run in runs
+    ]
     worst = max(count / taken for count, taken in zip(counts, steps, strict=True))
     number = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     measured = f"{sum(counts):,} violating of {sum(steps):,} steps in {number}"
@@ -174,8 +176,10 @@ def hostile(evidence: Evidence, flow: str) -> Finding:
 
 def afterwards(runs: Runs) -> Finding:
     """Judge that no constraint that was switched on after training is violated."""
-    evaluations = [each for run in runs for each in run.afterwards.values()]
-    return never_violated([(o.violations, o.steps) for each in evaluations for o in each.both])
+    evaluations = [evaluation for run in runs for evaluation in run.afterwards.values()]
+    return never_violated(
+        [(o.violations, o.steps) for evaluation in evaluations for o in evaluation.both]
+    )
 
 
 # Comparisons.
@@ -195,16 +199,16 @@ def steps_to_score(run: Record) -> float:
 def higher(runs: Runs, others: Mapping[str, Runs], value: Value, digits: int = 2) -> Finding:
     """Judge whether every interval of the difference to others lies above 0, or some, or none."""
     apart = _differences(runs, others, value)
-    above = [each.low > 0 for each in apart.values()]
-    below = any(each.high < 0 for each in apart.values())
+    above = [result.low > 0 for result in apart.values()]
+    below = any(result.high < 0 for result in apart.values())
     return Finding(_graded(all(above), any(above) and not below), _said(apart, digits))
 
 
 def at_least(runs: Runs, others: Mapping[str, Runs], value: Value) -> Finding:
     """Judge whether no other mean is higher, or none by more than its interval."""
     apart = _differences(runs, others, value)
-    means = all(each.value >= 0 for each in apart.values())
-    return Finding(_graded(means, all(each.high >= 0 for each in apart.values())), _said(apart))
+    means = all(result.value >= 0 for result in apart.values())
+    return Finding(_graded(means, all(result.high >= 0 for result in apart.values())), _said(apart))
 
 
 def faster(runs: Runs, others: Mapping[str, Runs]) -> Finding:
@@ -248,22 +252,22 @@ def beats_with_similar_violations(runs: Runs, other: Runs, name: str) -> Finding
 
 
 def _differences(runs: Runs, others: Mapping[str, Runs], value: Value) -> dict[str, Interval]:
-    counts = {"this flow": len(runs), **{name: len(each) for name, each in others.items()}}
+    counts = {"this flow": len(runs), **{name: len(other) for name, other in others.items()}}
     if few := [f"{count} of {name}" for name, count in counts.items() if count < 2]:
         raise Untested("needs two runs or more of each, given " + ", ".join(few))
     mine = [value(run) for run in runs]
-    return {name: difference(mine, [value(run) for run in each]) for name, each in others.items()}
+    return {name: difference(mine, [value(run) for run in other]) for name, other in others.items()}
 
 
 def _beside(runs: Runs, other: Runs, value: Value) -> tuple[Interval, Interval, Interval]:
     """Return the difference of two methods, and each by itself."""
     (apart,) = _differences(runs, {"the other": other}, value).values()
-    mine, theirs = (interquartile_mean([value(run) for run in each]) for each in (runs, other))
+    mine, theirs = (interquartile_mean([value(run) for run in group]) for group in (runs, other))
     return apart, mine, theirs
 
 
 def _said(apart: Mapping[str, Interval], digits: int = 2) -> str:
-    return "; ".join(f"{each.text(digits)} over {name}" for name, each in apart.items())
+    return "; ".join(f"{result.text(digits)} over {name}" for name, result in apart.items())
 
 
 def _graded(yes: bool, partly: bool = False) -> Verdict:

@@ -141,8 +141,12 @@ def draw_afterwards(runs: Runs) -> Figure:
         for above, below, change in zip(top, bottom, (None, *changes), strict=True):
             above.set_title(f"return, {change or 'as trained'}")
             below.set_title(f"violating steps, {change or 'as trained'}")
-            _draw_values(above, changed, _outcome(change, lambda each: each.return_mean))
-            counted = _outcome(change, lambda each: float(sum(each.violations.values())))
+            _draw_values(
+                above, changed, _outcome(change, lambda evaluation: evaluation.return_mean)
+            )
+            counted = _outcome(
+                change, lambda evaluation: float(sum(evaluation.violations.values()))
+            )
             _draw_values(below, changed, counted)
         ends = [end for axes in top for end in axes.get_xlim()]
         highest = max(axes.get_xlim()[1] for axes in bottom)
@@ -168,13 +172,15 @@ def draw_hostile(flows: Mapping[str, Sequence[HostileRun]]) -> Figure:
         for axes, constraint in zip(panels, constraints, strict=True):
             axes.set_title(f"{constraint}: violating steps per million, one dot a network")
             said = [
-                f"{sum(r.violations[constraint] for r in each):,} in "
-                f"{sum(r.steps for r in each):,} steps"
-                for each in runs
+                f"{sum(r.violations[constraint] for r in of_method):,} in "
+                f"{sum(r.steps for r in of_method):,} steps"
+                for of_method in runs
             ]
-            rates = [[rate(run, constraint) for run in each] for each in runs]
+            rates = [[rate(run, constraint) for run in of_method] for of_method in runs]
             draw_estimates(axes, _looks(names), [None] * len(names), rates, absent=said)
-            highest = max(rate(run, name) for each in runs for run in each for name in constraints)
+            highest = max(
+                rate(run, name) for of_method in runs for run in of_method for name in constraints
+            )
             count_axis(axes.xaxis, highest)
         _name_rows_once(panels, len(constraints))
     return figure
@@ -233,14 +239,16 @@ def _draw_curves(axes: Axes, runs: Runs, curve: Callable[[Record], Series]) -> f
 
 def _draw_values(axes: Axes, runs: Runs, value: Callable[[Record], float]) -> None:
     values = [[value(run) for run in records] for records in runs.values()]
-    draw_estimates(axes, _looks(runs), [interquartile_mean(each) for each in values], values)
+    draw_estimates(
+        axes, _looks(runs), [interquartile_mean(of_method) for of_method in values], values
+    )
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
 def _draw_moments(axes: Axes, runs: Runs, value: Callable[[Reached], float]) -> None:
     """Draw when runs reached the score; a method of which some never did has no estimate."""
     moments = [[reached(run) for run in records] for records in runs.values()]
-    values = [[value(moment) for moment in each if moment] for each in moments]
+    values = [[value(moment) for moment in of_method if moment] for of_method in moments]
     estimates = [
         interquartile_mean(v) if all(m) else None for v, m in zip(values, moments, strict=True)
     ]

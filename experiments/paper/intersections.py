@@ -72,7 +72,7 @@ def _random_region(families: Sequence[type[Ball] | type[Box]]) -> Region:
 
 def _try(region: Region, chosen: Tensor, judged: Sequence[int]) -> Tried:
     bijectors: dict[str, Bijector] = {
-        "squash": SquashChain([paper_squash(each) for each in region.sets[1:]]),
+        "squash": SquashChain([paper_squash(constraint_set) for constraint_set in region.sets[1:]]),
         "exact": ExactSquash(region),
     }
     outside, broken = {}, {}

@@ -151,8 +151,11 @@ class Record(Kept):
     @property
     def violations(self) -> int:
         """Violating steps in training and both evaluations, all constraints together."""
-        counts = [self.training_violations, *(each.violations for each in self.evaluation.both)]
-        return sum(sum(each.values()) for each in counts)
+        counts = [
+            self.training_violations,
+            *(evaluation.violations for evaluation in self.evaluation.both),
+        ]
+        return sum(sum(count.values()) for count in counts)
 
     def save(self, folder: Path) -> Path:
         """Write the record into a folder of records, complete or not at all, and return its path.
@@ -308,8 +311,8 @@ def _flat(content: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
     if not isinstance(content, Mapping) or not content:
         yield prefix, json.dumps(content)
         return
-    for name, each in content.items():
-        yield from _flat(each, f"{prefix}.{name}" if prefix else name)
+    for name, value in content.items():
+        yield from _flat(value, f"{prefix}.{name}" if prefix else name)
 
 
 def _in_words(error: Any) -> str:

@@ -141,8 +141,8 @@ def gather(folder: Path, *, hostile: Path = HOSTILE) -> Gathered:
     except (OSError, ValueError) as error:
         problems.append(f"{error} (the flow is drawn with {UNTRAINED.source})")
     # Where these folders stand on this machine is nothing to readers.
-    for each in (data, folder, hostile.parent):
-        problems = [problem.replace(f"{each}/", "") for problem in problems]
+    for path in (data, folder, hostile.parent):
+        problems = [problem.replace(f"{path}/", "") for problem in problems]
     runs = by_method(records)
     return Gathered(
         Evidence({name: runs[name] for name in in_order(runs)}, flows), problems, policy
@@ -219,7 +219,7 @@ def _page(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield _claims(["about its flow", *heads], about_flow)
     yield _claims(["about the other methods", "verdict"], [j for j in others if j.kind == "Claim"])
     yield "What the exact flow has to reach beyond that:"
-    yield _claims(["aim", "verdict"], [each for each in others if each.kind == "Aim"])
+    yield _claims(["aim", "verdict"], [other for other in others if other.kind == "Aim"])
     yield "## Training"
     yield _image(
         "training",
@@ -285,13 +285,14 @@ def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield "# Rules, measurements and provenance"
     yield "Behind [the paper's experiment, repeated](README.md)."
     yield "## Claims and rules"
-    for each in judged:
-        yield f"### {each.kind} {each.number}"
-        yield f"{each.claim.statement} *{each.claim.rule[0].upper()}{each.claim.rule[1:]}.*"
+    for judgment in judged:
+        claim = judgment.claim
+        yield f"### {judgment.kind} {judgment.number}"
+        yield f"{claim.statement} *{claim.rule[0].upper()}{claim.rule[1:]}.*"
         yield "\n".join(
-            (f"- {label(flow).name}: " if len(each.found) > 1 else "- ")
-            + f"{each.verdict(flow)}; {finding.measured}"
-            for flow, finding in each.found.items()
+            (f"- {label(flow).name}: " if len(judgment.found) > 1 else "- ")
+            + f"{judgment.verdict(flow)}; {finding.measured}"
+            for flow, finding in judgment.found.items()
         )
     yield "## All numbers"
     yield "Score and its speed are in [the first table](README.md#the-methods)."
@@ -306,7 +307,7 @@ def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
     yield hostile_table(evidence.hostile)
     yield "Each network is in `experiments/results/hostile_networks.md`."
     yield "## What was left out"
-    yield "\n".join(f"- {each}" for each in gathered.problems) or "Nothing."
+    yield "\n".join(f"- {problem}" for problem in gathered.problems) or "Nothing."
     yield "## How it was measured"
     yield configurations_table(runs)
     yield "Names of classes are those of the commits."
@@ -316,11 +317,11 @@ def _details(gathered: Gathered, judged: Sequence[Judged]) -> Iterator[str]:
 def _claims(head: Sequence[str], judged: Sequence[Judged]) -> str:
     rows = [
         [
-            f"[{each.number}](details.md#{each.kind.lower()}-{each.number})",
-            each.claim.statement,
-            *map(each.verdict, each.found),
+            f"[{judgment.number}](details.md#{judgment.kind.lower()}-{judgment.number})",
+            judgment.claim.statement,
+            *map(judgment.verdict, judgment.found),
         ]
-        for each in judged
+        for judgment in judged
     ]
     return table(["", *head], rows)
 
@@ -328,7 +329,7 @@ def _claims(head: Sequence[str], judged: Sequence[Judged]) -> str:
 def _values(numbers: Iterable[int]) -> str:
     """Return the smallest and the largest of some numbers in words, once where they agree."""
     ordered = sorted(numbers)
-    return " to ".join(f"{each:,}" for each in dict.fromkeys((ordered[0], ordered[-1])))
+    return " to ".join(f"{end:,}" for end in dict.fromkeys((ordered[0], ordered[-1])))
 
 
 def _image(name: str, title: str, caption: str) -> str:

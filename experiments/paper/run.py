@@ -53,7 +53,9 @@ def main(config: DictConfig) -> None:
     job = HydraConfig.get()
     method, folder = job.runtime.choices["experiment"], Path(job.runtime.output_dir)
     own = ("experiment", "seed", *PRESENTATION)
-    overrides = [each for each in job.overrides.task if each.split("=", 1)[0] not in own]
+    overrides = [
+        override for override in job.overrides.task if override.split("=", 1)[0] not in own
+    ]
     try:
         # Another command that does the same run is waited for; its record then is taken.
         with (
@@ -131,7 +133,7 @@ def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
         curves={
             name: Series(
                 steps=tuple(int(step) for step in steps),
-                values=tuple(_short(float(each)) for each in values),
+                values=tuple(_short(float(value)) for value in values),
             )
             for name, (steps, values) in curves.items()
         },
@@ -150,7 +152,7 @@ def settings(config: Mapping[Any, Any]) -> dict[str, Any]:
         config: plain data, with every interpolation resolved.
     """
     return json.loads(
-        json.dumps({name: each for name, each in config.items() if name not in PRESENTATION})
+        json.dumps({name: value for name, value in config.items() if name not in PRESENTATION})
     )
 
 

@@ -105,9 +105,9 @@ def band(series: Sequence[Series]) -> Band:
     Raises:
         ValueError: for no runs, and for runs with entries at other steps than the first's.
     """
-    if not series or any(each.steps != series[0].steps for each in series):
+    if not series or any(curve.steps != series[0].steps for curve in series):
         raise ValueError("series: expected one or more, with entries at the same steps")
-    data = np.array([each.values for each in series], dtype=np.float64)
+    data = np.array([curve.values for curve in series], dtype=np.float64)
     value = _trimmed(data, 0)
     low, high = (value, value) if len(data) == 1 else _bootstrap((data,), _trimmed, axis=0)
     return Band(np.array(series[0].steps, dtype=np.float64), value, low, high)
@@ -151,7 +151,7 @@ def violation_rate(record: Record, constraint: str) -> Series:
     edges = together * np.arange(1.0 + whole) if whole else np.array([0.0, record.steps])
     curve = record.curves[VIOLATIONS + constraint]
     counts = np.diff(np.interp(edges, [0, *curve.steps], [0.0, *curve.values]))
-    middles = tuple(round(each) for each in ((edges[:-1] + edges[1:]) / 2).tolist())
+    middles = tuple(round(value) for value in ((edges[:-1] + edges[1:]) / 2).tolist())
     return Series(steps=middles, values=tuple((counts * length / np.diff(edges)).tolist()))
 
 

@@ -40,8 +40,8 @@ def methods_table(runs: Runs) -> str:
         rows.append(
             [
                 label(method).name,
-                *(interquartile_mean(each).text() for each in scores),
-                _moment(moments, [each.steps for each in moments if each]),
+                *(interquartile_mean(score).text() for score in scores),
+                _moment(moments, [moment.steps for moment in moments if moment]),
                 f"{max(run.violations for run in records):,}",
             ]
         )
@@ -59,7 +59,7 @@ def speed_table(runs: Runs) -> str:
                 label(method).name,
                 str(len(records)),
                 interquartile_mean([area_under_score(run) for run in records]).text(),
-                _moment(moments, [each.processor_seconds for each in moments if each]),
+                _moment(moments, [moment.processor_seconds for moment in moments if moment]),
                 interquartile_mean([run.seconds for run in records]).text(0),
             ]
         )
@@ -79,7 +79,7 @@ def violations_table(runs: Runs) -> str:
             training = [run.training_violations[name] for run in records]
             evaluated = [sum(o.violations[name] for o in r.evaluation.both) for r in records]
             cells += [_count(training), _count(evaluated)]
-        rows.append([*cells, *(each.text() for each in start_and_end(records))])
+        rows.append([*cells, *(record.text() for record in start_and_end(records))])
     head = ["violating steps of a run"]
     for name in constraints:
         head += [f"{name}, training", f"{name}, evaluation"]
@@ -117,7 +117,10 @@ def hostile_table(flows: Mapping[str, Sequence[HostileRun]]) -> str:
             label(name).name,
             str(len(flows[name])),
             f"{sum(run.steps for run in flows[name]):,}",
-            *(f"{sum(run.violations[each] for run in flows[name]):,}" for each in constraints),
+            *(
+                f"{sum(run.violations[constraint] for run in flows[name]):,}"
+                for constraint in constraints
+            ),
         ]
         for name in in_order(flows)
     ]
@@ -146,7 +149,7 @@ def in_words(apart: Mapping[str, tuple[str | None, str | None]]) -> str:
     said = []
     for name, (_, value) in apart.items():
         what = name.removesuffix("._target_")
-        if value is None and any(each.startswith(f"{name}.") for each in apart):
+        if value is None and any(result.startswith(f"{name}.") for result in apart):
             continue
         if value is not None and what != name:
             value = value.strip('"').rpartition(".")[2]
@@ -167,8 +170,7 @@ def provenance(runs: Runs) -> str:
         f"- Intervals: percentile bootstrap of the interquartile mean, {RESAMPLES:,} resamples "
         f"of the seeds, {100 * CONFIDENCE:.0f} %, seed {BOOTSTRAP_SEED}; differences resample "
         "both methods. A few seeds bound an interval only roughly.\n"
-        f"- Versions: {', '.join(f'{name} {each}' for name, each in versions.items())}; commit "
-        f"{commits}.\n"
+        f"- Versions: {', '.join(map(' '.join, versions.items()))}; commit {commits}.\n"
         "- From nothing: `make paper` does the same runs, into `outputs/paper`; with other "
         'methods, seeds or budgets: `make paper ARGS="experiment=exact,squash seed=0,1 '
         'collector.total_frames=8000"`.\n'
@@ -193,8 +195,8 @@ def _count(counts: Sequence[int]) -> str:
 def _outcomes(outcomes: Sequence[Outcome]) -> tuple[str, str]:
     if not outcomes:
         return "-", "-"
-    returned: Interval = interquartile_mean([each.return_mean for each in outcomes])
-    return returned.text(1), _count([sum(each.violations.values()) for each in outcomes])
+    returned: Interval = interquartile_mean([outcome.return_mean for outcome in outcomes])
+    return returned.text(1), _count([sum(outcome.violations.values()) for outcome in outcomes])
 
 
 def _all_of(values: Iterable[str]) -> str:

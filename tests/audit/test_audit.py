@@ -89,7 +89,7 @@ def with_geometry(base: EnvBase, geometry: GeometryTransform) -> TransformedEnv:
 
 
 def of(report: AuditReport, source: str, name: str = "disc") -> ConstraintMetrics:
-    (found,) = (each for each in report.sources[source] if each.name == name)
+    (found,) = (state for state in report.sources[source] if state.name == name)
     return found
 
 

@@ -119,7 +119,7 @@ def test_wrong_geometry_is_caught_with_its_state(
     assert violated[guilty] == 1
     assert example["violates"] == [name for name, cost in violated.items() if cost]
     assert f"{guilty}, rollouts, worst of unsound" in str(report)
-    (scene,) = (each for each in report.worst_states if each.name == guilty)
+    (scene,) = (state for state in report.worst_states if state.name == guilty)
     assert "violate" in scene.reason
     assert bool((scene.inside & scene.violates).any())
 
@@ -143,7 +143,7 @@ def test_the_figure_shows_the_worst_states(tmp_path: Path) -> None:
     report = audited(BatteryGeometry(), WallsOnly(), states=16, actions=8)
     assert [scene.name for scene in report.worst_states] == ORDER
     text = [t.get_text() for t in audit_figure(report).findobj() if hasattr(t, "get_text")]
-    assert any("in the set violate" in each for each in text)
+    assert any("in the set violate" in value for value in text)
     path = save_audit(report, tmp_path / "audit.png")
     assert path.read_bytes().startswith(b"\x89PNG")
     assert path.stat().st_size > 20_000

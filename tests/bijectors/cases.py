@@ -77,7 +77,7 @@ class Case:
 
     @property
     def batch_shape(self) -> torch.Size:
-        shapes = [each.batch_shape for each in self.sets]
+        shapes = [constraint_set.batch_shape for constraint_set in self.sets]
         if self.anchor is not None:
             shapes.append(self.anchor.shape[:-1])
         if self.active is not None:
@@ -96,7 +96,9 @@ class Case:
         if self.anchor is None:
             return 1.0
         sizes = [
-            float(each.fields()["radius"].max()) for each in self.sets if isinstance(each, Ball)
+            float(constraint_set.fields()["radius"].max())
+            for constraint_set in self.sets
+            if isinstance(constraint_set, Ball)
         ]
         slack = self.region(torch.float64).slack(self.anchor).min()
         return max([self.size, *sizes]) / float(slack)
@@ -113,7 +115,7 @@ class Case:
         return 4 * 2.0**-52 * self.tightness**2 if self.saturates else 0.0
 
     def cast(self, dtype: torch.dtype) -> tuple[ConstraintSet, ...]:
-        return tuple(cast(each, dtype) for each in self.sets)
+        return tuple(cast(constraint_set, dtype) for constraint_set in self.sets)
 
     def region(self, dtype: torch.dtype) -> Region:
         assert self.anchor is not None
@@ -124,7 +126,9 @@ class Case:
             case "squash":
                 return paper_squash(self.cast(dtype)[0])
             case "chain":
-                return SquashChain([paper_squash(each) for each in self.cast(dtype)])
+                return SquashChain(
+                    [paper_squash(constraint_set) for constraint_set in self.cast(dtype)]
+                )
             case "aligned":
                 return ExactSquash(self.region(dtype))
             case "gauge":
@@ -162,10 +166,12 @@ class Case:
 
     def reference(self, index: tuple[int, ...]) -> Callable[[list[mpf]], tuple[list[mpf], mpf]]:
         """Return the flow of one batch element in mpmath."""
-        sets = [element(each, self.batch_shape, index) for each in self.sets]
+        sets = [element(constraint_set, self.batch_shape, index) for constraint_set in self.sets]
         if self.active is not None:
             active = self.active.expand((*self.batch_shape, len(sets)))[index]
-            sets = [each for each, holds in zip(sets, active, strict=True) if holds]
+            sets = [
+                constraint_set for constraint_set, holds in zip(sets, active, strict=True) if holds
+            ]
         if self.kind in ("squash", "chain"):
             return reference_chain(sets)
         assert self.anchor is not None
@@ -179,16 +185,16 @@ def reference_chain(
 ) -> Callable[[list[mpf]], tuple[list[mpf], mpf]]:
     def flow(point: list[mpf]) -> tuple[list[mpf], mpf]:
         total = mpf(0)
-        for each in sets:
-            match each:
+        for constraint_set in sets:
+            match constraint_set:
                 case Box():
-                    point, log_det = reference.box_squash(each, point)
+                    point, log_det = reference.box_squash(constraint_set, point)
                 case Ball():
-                    point, log_det = reference.ball_squash(each, point)
+                    point, log_det = reference.ball_squash(constraint_set, point)
                 case Ellipsoid():
-                    point, log_det = reference.ellipsoid_squash(each, point)
+                    point, log_det = reference.ellipsoid_squash(constraint_set, point)
                 case _:
-                    raise NotImplementedError(type(each).__name__)
+                    raise NotImplementedError(type(constraint_set).__name__)
             total += log_det
         return point, total
 
@@ -487,7 +493,7 @@ def exact_flows() -> tuple[Case, ...]:
     for name, (sets, anchor, active) in regions().items():
         smooth = len(sets) == 1
         found.append(Case(f"gauge-{name}", "gauge", sets, anchor, active, smooth=smooth))
-        boxes = all(isinstance(each, Box) for each in sets)
+        boxes = all(isinstance(constraint_set, Box) for constraint_set in sets)
         found.append(Case(f"aligned-{name}", "aligned", sets, anchor, active, smooth=boxes))
         found.append(Case(f"radial-{name}", "radial", sets, anchor, active))
         found.append(Case(f"soft-{name}", "soft", sets, anchor, active))

@@ -208,8 +208,16 @@ def soft_squash(
     assert isinstance(bounds, Box)
     bounded, log_det = box_squash(bounds, latent)
     offset = [x - y for x, y in zip(bounded, c, strict=True)]
-    boxes = [each for each in sets if isinstance(each, Box)] if by_components else [bounds]
-    rest = [each for each in sets[1:] if not any(each is box for box in boxes)]
+    boxes = (
+        [constraint_set for constraint_set in sets if isinstance(constraint_set, Box)]
+        if by_components
+        else [bounds]
+    )
+    rest = [
+        constraint_set
+        for constraint_set in sets[1:]
+        if not any(constraint_set is box for box in boxes)
+    ]
     inner = merged(boxes)
     offset, change = soft_components(bounds, inner, c, offset, sharpness)
     log_det += change
@@ -223,8 +231,8 @@ def soft_retraction(
     """Retract R^d softly: bounds and boxes by components, other sets along rays."""
     c = to_mp(anchor)
     offset = [x - y for x, y in zip(latent, c, strict=True)]
-    inner = merged([each for each in sets if isinstance(each, Box)])
-    rest = [each for each in sets if not isinstance(each, Box)]
+    inner = merged([constraint_set for constraint_set in sets if isinstance(constraint_set, Box)])
+    rest = [constraint_set for constraint_set in sets if not isinstance(constraint_set, Box)]
     offset, log_det = soft_components(None, inner, c, offset, sharpness)
     point, change = soft_ray(exit_along(c, offset, [inner]), [inner, *rest], c, offset, sharpness)
     return point, log_det + change
@@ -274,13 +282,13 @@ def exit_along(anchor: Vector, offset: Vector, sets: Sequence[ConstraintSet]) ->
     assert isinstance(box, Box)
     faces = zip(to_mp(box.low), to_mp(box.high), anchor, offset, strict=True)
     outside = min(((high if v > 0 else low) - c) / v for low, high, c, v in faces if v != 0)
-    for each in sets[1:]:
+    for constraint_set in sets[1:]:
         inside, beyond = mpf(0), outside
-        if level(each, along(anchor, offset, beyond)) <= 1:
+        if level(constraint_set, along(anchor, offset, beyond)) <= 1:
             continue
         while beyond - inside > beyond * mpf(10) ** -20:
             middle = (inside + beyond) / 2
-            if level(each, along(anchor, offset, middle)) <= 1:
+            if level(constraint_set, along(anchor, offset, middle)) <= 1:
                 inside = middle
             else:
                 beyond = middle
@@ -299,7 +307,7 @@ def to_mp(value: Tensor) -> mpf | Vector | list[Vector]:
     """Return the exact values of a tensor, as nested lists."""
 
     def convert(item: float | list) -> mpf | list:
-        return [convert(each) for each in item] if isinstance(item, list) else mpf(item)
+        return [convert(value) for value in item] if isinstance(item, list) else mpf(item)
 
     return convert(value.double().tolist())
 

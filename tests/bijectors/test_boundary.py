@@ -50,8 +50,8 @@ def of_table(case: Case) -> Edge:
     def make(dtype: torch.dtype, change: Callable[[Tensor], Tensor]) -> Bijector:
         # Rounded before they are changed, as `Case.build` does.
         sets = tuple(
-            each.with_fields(lambda field, _: change(field.to(dtype)).to(field))
-            for each in case.sets
+            constraint_set.with_fields(lambda field, _: change(field.to(dtype)).to(field))
+            for constraint_set in case.sets
         )
         return Case(case.name, case.kind, sets, case.anchor, case.active).build(dtype)
 
@@ -141,7 +141,7 @@ def assert_decided_by_one(
     assert (log_prob < torch.inf).all()
     scored = log_prob[log_prob.isfinite()].sum()
     of_actions, *of_parameters = torch.autograd.grad(scored, (actions, *parameters))
-    assert all(each.isfinite().all() for each in of_parameters)
+    assert all(gradient.isfinite().all() for gradient in of_parameters)
     # Behind errors that are drawn anew, two runs of one computation may differ.
     if repeatable:
         assert of_actions.isfinite().all()

@@ -47,8 +47,8 @@ def fresh_compiler() -> Iterator[None]:
 
 def unchecked(case: Case, fields: list[dict[str, Tensor]]) -> tuple[ConstraintSet, ...]:
     return tuple(
-        type(each)(**values, validate_args=False)
-        for each, values in zip(case.sets, fields, strict=True)
+        type(constraint_set)(**values, validate_args=False)
+        for constraint_set, values in zip(case.sets, fields, strict=True)
     )
 
 
@@ -58,7 +58,7 @@ def build(case: Case, fields: list[dict[str, Tensor]], anchor: Tensor) -> Biject
     if case.kind == "squash":
         return paper_squash(sets[0])
     if case.kind == "chain":
-        return SquashChain([paper_squash(each) for each in sets])
+        return SquashChain([paper_squash(constraint_set) for constraint_set in sets])
     if case.kind == "retraction":
         outer = sets[0]
         assert isinstance(outer, Box)
@@ -82,7 +82,7 @@ def function(case: Case) -> Function:
 
 
 def arguments(case: Case) -> tuple[list[dict[str, Tensor]], Tensor]:
-    fields = [cast(each, torch.float32).fields() for each in case.sets]
+    fields = [cast(constraint_set, torch.float32).fields() for constraint_set in case.sets]
     return fields, torch.zeros(case.dim) if case.anchor is None else case.anchor.float()
 
 

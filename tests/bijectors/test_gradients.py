@@ -88,7 +88,9 @@ def test_gradients_in_one_dimension_are_bounded(dtype: torch.dtype) -> None:
     """There are two directions only, in each of which the share is constant."""
     sets = Box(tensor(-1.0), tensor(1.0)), Ball(tensor(0.2), tensor(0.3).squeeze())
     bijector = GaugeSquash(
-        Region(tuple(cast(each, dtype) for each in sets), torch.zeros(1).to(dtype))
+        Region(
+            tuple(cast(constraint_set, dtype) for constraint_set in sets), torch.zeros(1).to(dtype)
+        )
     )
     for length in (0.0, 1e-40, 1e-20, 1e-12, 1e-3, 1.0, 20.0, 1e6):
         _, of_log_det = gradients(bijector, length * torch.tensor([[1.0], [-1.0]]).to(dtype))

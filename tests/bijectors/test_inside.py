@@ -82,13 +82,15 @@ def violations_of(
     build: Build, make: Maker, constraints: Sequence[ConstraintSet], lengths: tuple
 ) -> int:
     sets = (make.bounds(), *constraints)
-    single = tuple(cast(each, torch.float32) for each in sets)
+    single = tuple(cast(constraint_set, torch.float32) for constraint_set in sets)
     bijector = build(Region(single, make.anchor.float()))
     case = Case("", "gauge", sets, make.anchor)
     count = 0
     for length in lengths:
         action, log_det = bijector.forward_and_log_det(latents(case, 1, torch.float32, length))
-        inside = np.logical_and.reduce([reference.contains(each, action) for each in sets])
+        inside = np.logical_and.reduce(
+            [reference.contains(constraint_set, action) for constraint_set in sets]
+        )
         count += int((~inside).sum()) + int((~log_det.isfinite()).sum())
     return count
 

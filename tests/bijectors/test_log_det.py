@@ -64,4 +64,4 @@ def some_indices(batch_shape: torch.Size) -> list[tuple[int, ...]]:
 
 
 def exact(value: Tensor) -> list[mpf]:
-    return [mpf(each) for each in value.tolist()]
+    return [mpf(value) for value in value.tolist()]

@@ -65,7 +65,7 @@ def test_each_batch_element_is_computed_by_itself(case: Case) -> None:
 
 def single(case: Case, at: tuple[int, ...]) -> Case:
     """Return the case of one batch element."""
-    sets = tuple(element(each, case.batch_shape, at) for each in case.sets)
+    sets = tuple(element(constraint_set, case.batch_shape, at) for constraint_set in case.sets)
     anchor, active = case.anchor, case.active
     if anchor is not None:
         anchor = anchor.expand((*case.batch_shape, case.dim))[at]

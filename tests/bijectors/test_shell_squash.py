@@ -36,7 +36,7 @@ def test_inverse_and_log_det(dim: int, with_region: bool) -> None:
     torch.testing.assert_close(back, latent, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(inverse_log_det, -log_det, rtol=1e-6, atol=1e-6)
     jacobians = torch.stack(
-        [torch.autograd.functional.jacobian(squash, each) for each in latent]  # type: ignore[arg-type]
+        [torch.autograd.functional.jacobian(squash, row) for row in latent]  # type: ignore[arg-type]
     )
     torch.testing.assert_close(log_det, torch.linalg.slogdet(jacobians)[1], rtol=1e-9, atol=1e-9)
     assert squash.contains(action).all()

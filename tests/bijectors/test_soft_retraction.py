@@ -50,8 +50,8 @@ def test_divisors_of_1e8_in_float64(build: Callable, sharpness: float) -> None:
     for length in LENGTHS:
         action, log_det = bijector.forward_and_log_det(latents(case, 20, torch.float64, length))
         assert log_det.isfinite().all()
-        for each in sets:
-            assert reference.contains(each, action, np.longdouble).all()
+        for constraint_set in sets:
+            assert reference.contains(constraint_set, action, np.longdouble).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -73,7 +73,7 @@ def test_factors_match_mpmath_over_their_whole_range(dtype: torch.dtype, sharpne
 
 
 def _flat(value: Tensor) -> list[mpf]:
-    return [mpf(each) for each in value.double().flatten().tolist()]
+    return [mpf(value) for value in value.double().flatten().tolist()]
 
 
 @pytest.mark.parametrize("case", SATURATING, ids=lambda case: case.name)

@@ -29,12 +29,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder.path
 
 
-@pytest.mark.filterwarnings("ignore")  # of the exporters themselves
 def test_a_run_is_exported_and_tested(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main([str(run), "--to", "torch", "--steps", "0", "--states", "500", "--fallback", "0.5,-0.5"])
-    said = capsys.readouterr().out
-    assert "of 500 states" in said
-    assert ", 0 violations in them" in said
+    printed = capsys.readouterr()
+    assert "of 500 states" in printed.out
+    assert ", 0 violations in them" in printed.out
+    assert not printed.err
     manifest = json.loads((run / "export" / "manifest.json").read_text())
     assert manifest["fallback"] == [0.5, -0.5]
     assert manifest["self_test"]["states"] == 500

@@ -40,7 +40,7 @@ REFUSED_OF_OPTIONS = {
     "experiment=penalty env.penalty.penalty": ("a finite number > 0", "abc"),
     "experiment=squash_radius_4 flow.max_radius": ("a number > 0", "abc"),
     "experiment=lagrangian loss.gamma_cost": ("a discount", "abc"),
-    "experiment=lagrangian loss.thresholds": ("a list of finite numbers >= 0", "[0,-1]"),
+    "experiment=lagrangian loss.thresholds": ("a finite number >= 0, or a list", "[0,-1]"),
     "experiment=lagrangian loss.lambda_init": ("a finite number > 0", "abc"),
     "experiment=lagrangian loss.lambda_max": ("a finite number > 0", "abc"),
     "experiment=lagrangian loss.num_cost_nets": (COUNT, "1.5"),

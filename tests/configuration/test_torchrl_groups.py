@@ -82,7 +82,7 @@ def test_transforms_are_made_and_fields_are_arguments(groups: ModuleType) -> Non
         (groups.ConstrainedActionsConfig(unbounded=True), ConstrainedActions),
     ):
         assert isinstance(instantiate(OmegaConf.structured(node)), made)
-        assert {each.name for each in fields(node)} - {"_target_"}
+        assert {field.name for field in fields(node)} - {"_target_"}
 
 
 # Of TorchRL's trainers themselves.
@@ -94,7 +94,7 @@ def test_torchrls_trainer_trains_within_the_constraints() -> None:
     trainer = instantiate(config.trainer)
     assert isinstance(trainer.loss_module, ConstrainedSACLoss)
     env = trainer.collector.env
-    assert any(isinstance(each, ActionGuard) for each in appended_transforms(env))
+    assert any(isinstance(transform, ActionGuard) for transform in appended_transforms(env))
     acting = trainer.collector.policy
     assert flow_head(acting).order == ["battery", "obstacle"]
     first = TensorDict.from_module(acting).data.clone()

@@ -147,7 +147,7 @@ def own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str
     (tmp_path / "own_pkg" / "__init__.py").write_text("from own_pkg.envs import Env\n")
     (tmp_path / "own_pkg" / "envs.py").write_text(OWN)
     yield "own_pkg.envs"
-    for name in [each for each in sys.modules if each.startswith("own_pkg")]:
+    for name in [module for module in sys.modules if module.startswith("own_pkg")]:
         del sys.modules[name]
 
 
@@ -233,7 +233,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
 @pytest.mark.parametrize("kind", REFUSED)
 def test_a_strangers_configuration_is_refused(section: str, kind: str, tmp_path: Path) -> None:
     content, where = REFUSED[kind]
-    sections: dict[str, Any] = {each: {} for each in BUILT} | {section: {"some": content}}
+    sections: dict[str, Any] = {key: {} for key in BUILT} | {section: {"some": content}}
     (tmp_path / CONFIG).write_text(yaml.safe_dump(sections))
     with pytest.raises(PermissionError, match=where) as caught:
         RunFolder(tmp_path).load_config()
@@ -246,7 +246,7 @@ def test_a_strangers_configuration_is_refused(section: str, kind: str, tmp_path:
 @pytest.mark.parametrize("kind", REFUSED)
 def test_a_strangers_run_is_not_trained_further(kind: str, tmp_path: Path) -> None:
     content, where = REFUSED[kind]
-    sections: dict[str, Any] = {each: {} for each in BUILT} | {"optim": {"some": content}}
+    sections: dict[str, Any] = {key: {} for key in BUILT} | {"optim": {"some": content}}
     (tmp_path / CONFIG).write_text(yaml.safe_dump(sections))
     with pytest.raises(PermissionError, match=where):
         RunFolder(tmp_path).load_training_config()
@@ -378,7 +378,7 @@ def test_every_command_refuses(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    given = [each.format(run=evil_run, place=tmp_path / "out") for each in COMMANDS[command]]
+    given = [key.format(run=evil_run, place=tmp_path / "out") for key in COMMANDS[command]]
     monkeypatch.setattr(sys, "argv", [command, *given])
     with pytest.raises(SystemExit):
         load_command(command)()

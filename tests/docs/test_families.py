@@ -45,7 +45,7 @@ def test_it_is_the_intersection_of_half_spaces(guide: dict[str, Any]) -> None:
     half_spaces = HalfSpaces(rows.normals, rows.offsets)
     way = torch.randn(100, 5, 3)
     torch.testing.assert_close(sets.slack(way), half_spaces.slack(way))
-    gauges = [each.gauge(way, sets.center) for each in (sets, half_spaces)]
+    gauges = [family.gauge(way, sets.center) for family in (sets, half_spaces)]
     torch.testing.assert_close(*gauges, rtol=1e-4, atol=1e-4)
 
 

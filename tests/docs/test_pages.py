@@ -1,6 +1,7 @@
 """The pages' code runs as it stands there, and their links lead somewhere."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,25 @@ def test_readme_says_it_in_ten_lines() -> None:
 )
 def test_readme_has_the_words_that_people_search_for(words: str) -> None:
     assert words.lower() in " ".join(PAGES[0].read_text().split()).lower()
+
+
+def test_the_map_of_the_house_has_its_rooms_in_the_linters_order() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    (layers,) = (
+        contract["layers"]
+        for contract in settings["tool"]["importlinter"]["contracts"]
+        if contract["type"] == "layers"
+    )
+    ranks = {
+        room.strip("() ").removeprefix("cnfp_torchrl."): -rank
+        for rank, layer in enumerate(layers)
+        for room in layer.split(":")
+    }
+    text = (ROOT / ".github" / "CONTRIBUTING.md").read_text()
+    shown = re.findall(r"^\| `(\w+)(?:/|\.py)` \|", text, flags=re.MULTILINE)
+    packages = {path.parent.name for path in (ROOT / "cnfp_torchrl").glob("*/__init__.py")}
+    assert packages <= set(shown) <= ranks.keys()
+    assert [ranks[room] for room in shown] == sorted(ranks[room] for room in shown)
 
 
 def test_citation_is_of_this_version() -> None:

@@ -378,7 +378,7 @@ def test_bijectors_are_those_of_the_geometries() -> None:
     env = point_nav(3)
     env.append_transform(RewardSum())
     bijectors = constraint_bijectors(env)
-    assert [(each.name, each.set_type) for each in bijectors] == [
+    assert [(bijector.name, bijector.set_type) for bijector in bijectors] == [
         ("battery", Ball),
         ("obstacle", Box),
     ]
@@ -447,9 +447,9 @@ def test_constrain_env_publishes_everything_the_actor_needs() -> None:
         PointNavEnv([3], seed=0), Compose(RewardSum(), BatteryGeometry(), ObstacleGeometry())
     )
     by_hand.append_transform(ConstraintAnchor(constraint_bijectors(by_hand)))
-    for each in (env, by_hand):
-        each.set_seed(3)
-    given, expected = (each.reset()["constraints"] for each in (env, by_hand))
+    for built in (env, by_hand):
+        built.set_seed(3)
+    given, expected = (built.reset()["constraints"] for built in (env, by_hand))
     assert (given == expected).all()
     with pytest.raises(ValueError, match="order: expected each of the constraints"):
         constrain_env(base, BatteryGeometry(), order=ORDER)

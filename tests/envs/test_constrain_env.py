@@ -40,7 +40,7 @@ def test_priority_is_the_stated_one_with_and_without_anchor(
         order=order,
         with_anchor=with_anchor,
     )
-    assert [each.name for each in constraint_bijectors(env)] == order
+    assert [bijector.name for bijector in constraint_bijectors(env)] == order
     assert (("constraints", "anchor") in env.reset().keys(include_nested=True)) is with_anchor
 
 

@@ -106,8 +106,8 @@ def test_a_replay_buffer_computes_instead_of_storing() -> None:
     rollout = env_with(*geometries, batch_size=()).rollout(20)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), batch_size=20)
     buffer.extend(rollout.exclude("constraints", ("next", "constraints")))
-    for each in (ObstacleGeometry(), BatteryGeometry()):
-        buffer.append_transform(each)
+    for geometry in (ObstacleGeometry(), BatteryGeometry()):
+        buffer.append_transform(geometry)
     sample = buffer.sample()
     order = sample["index"]
     for key in rollout["constraints"].keys(True, True):
@@ -365,13 +365,13 @@ def test_a_step_reads_its_checks_on_the_host_once() -> None:
     plain = PointNavEnv([STATES], seed=0)
     env = constrain_env(PointNavEnv([STATES], seed=0), ObstacleGeometry(), BatteryGeometry())
     counts = []
-    for each in (plain, env):
-        state = each.reset()
+    for built in (plain, env):
+        state = built.reset()
         state["action"] = torch.zeros(STATES, 2)
-        state = each.step_mdp(each.step(state))
+        state = built.step_mdp(built.step(state))
         state["action"] = torch.zeros(STATES, 2)
         with HostReads() as reads:
-            each.step(state)
+            built.step(state)
         counts.append(reads.count)
     assert counts[1] - counts[0] == 1
 

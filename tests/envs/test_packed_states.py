@@ -52,7 +52,7 @@ def stream(agents: int, steps: int, length: int, *, horizon: int = 1) -> Iterato
             ended = torch.rand(agents, generator=generator) < 1 / length
             start = torch.tensor([next(fresh) for _ in range(agents)])
             now = torch.where(ended, start, after)
-        roots, afters = (torch.stack(each, -1).flatten() for each in zip(*columns, strict=True))
+        roots, afters = (torch.stack(row, -1).flatten() for row in zip(*columns, strict=True))
         yield transitions(roots, afters)
 
 
@@ -132,8 +132,12 @@ def test_rare_entries_are_what_was_stored(
 def test_batches_of_other_sizes_and_in_another_order_are_right() -> None:
     generator = torch.Generator().manual_seed(1)
     batches = [
-        each[torch.randperm(len(each), generator=generator)[: 1 + index % len(each)]]
-        for index, each in enumerate(stream(6, 40, 5))
+        constraint_set[
+            torch.randperm(len(constraint_set), generator=generator)[
+                : 1 + index % len(constraint_set)
+            ]
+        ]
+        for index, constraint_set in enumerate(stream(6, 40, 5))
     ]
     filled(iter(batches), 64)
 

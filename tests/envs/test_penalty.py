@@ -24,10 +24,10 @@ def test_a_violation_costs_the_penalty(batch_size: tuple[int, ...], penalty: flo
     paid = TransformedEnv(env, Compose(RewardSum(), RewardPenalty(penalty)))
     check_env_specs(paid)
     data = []
-    for each in (paid, plain):
-        each.set_seed(5)
+    for built in (paid, plain):
+        built.set_seed(5)
         torch.manual_seed(5)
-        data.append(each.rollout(steps, break_when_any_done=False))
+        data.append(built.rollout(steps, break_when_any_done=False))
     punished, raw = data
     reward = raw["next", "reward"]
     assert torch.equal(punished["next", "raw_reward"], reward)
@@ -92,7 +92,9 @@ def test_a_number_is_a_penalty_too_and_zero_is_none(number: str, paid: float | N
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         config = compose("train", overrides=[f"env.penalty={number}"])
     env = build_environment(config, batch_size=[2], with_penalty=True)
-    penalties = [each.penalty for each in env.transform if isinstance(each, RewardPenalty)]
+    penalties = [
+        transform.penalty for transform in env.transform if isinstance(transform, RewardPenalty)
+    ]
     assert penalties == ([] if paid is None else [paid])
 
 

@@ -23,7 +23,7 @@ def drive(env: EnvBase, steps: int) -> list[str]:
         warnings.simplefilter("always")
         env.rollout(steps, break_when_any_done=False)
     kind = RelaxedEverywhereWarning
-    return [str(each.message) for each in caught if issubclass(each.category, kind)]
+    return [str(warning.message) for warning in caught if issubclass(warning.category, kind)]
 
 
 @pytest.mark.parametrize("agents", [STATES, 64])

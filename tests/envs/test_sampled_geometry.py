@@ -83,8 +83,10 @@ def bytes_of_a_transition(env: TransformedEnv, keys: list[NestedKey], limit: int
         buffer.extend(steps[..., time].reshape(-1).select(*kept))
     stored = buffer.storage.get(range(len(buffer)))
     total = sum(value.nbytes for value in stored.values(True, True))
-    packed = [each for each in buffer._transform or [] if isinstance(each, PackedStates)]
-    return (total + sum(each.nbytes for each in packed)) / len(buffer)
+    packed = [
+        transform for transform in buffer._transform or [] if isinstance(transform, PackedStates)
+    ]
+    return (total + sum(transform.nbytes for transform in packed)) / len(buffer)
 
 
 @ALL_ENVS

@@ -198,10 +198,10 @@ def test_thin_and_wide_sets_are_kept(dtype: torch.dtype) -> None:
             WeightedL1Ball(ones, half),
             PositivePart(ones, 2 * half),
         ]
-        for each in thin:
-            sets = [Box(-ones, ones), each]
+        for constraint_set in thin:
+            sets = [Box(-ones, ones), constraint_set]
             found = lexicographic_anchor(sets)
-            assert found.active.all(), type(each).__name__
+            assert found.active.all(), type(constraint_set).__name__
             check(sets, found)
         wide = [Box(-1e3 * ones, 1e3 * ones), Ball(900 * ones, 1e3 * torch.ones((), dtype=dtype))]
         found = lexicographic_anchor(wide)
@@ -215,7 +215,7 @@ def test_a_candidate_decides_where_it_is_roomy() -> None:
     for candidate in (t(0.05, -0.6), t(0.0, -0.55)):
         anchor, decided = attempt_anchor(sets, candidate, steps=0)
         assert decided
-        assert min(each.slack(anchor) for each in sets) > 0.18
+        assert min(constraint_set.slack(anchor) for constraint_set in sets) > 0.18
     for candidate in (t(0.9, 0.9), t(torch.nan, 0.0)):
         _, decided = attempt_anchor(sets, candidate, steps=0)
         assert not decided
@@ -358,8 +358,8 @@ def test_sets_far_beyond_the_bounds_are_dropped(distance: float, dtype: torch.dt
         Ellipsoid(center, (radius[:, None, None] * identity)),
         TaskSpaceBall(identity.expand(9, 2, 2), -center, radius),
     )
-    for each in far:
-        sets = [each.to(dtype) for each in (BOUNDS, each)]
+    for constraint_set in far:
+        sets = [constraint_set.to(dtype) for constraint_set in (BOUNDS, constraint_set)]
         found = lexicographic_anchor(sets)
         assert found.anchor.isfinite().all()
         assert BOUNDS.contains(found.anchor).all()
@@ -380,7 +380,7 @@ def test_what_lies_beside_a_shadow_is_visible(
     sets = [BOUNDS, ball, visible] if visible_last else [BOUNDS, visible, ball]
     found = lexicographic_anchor(sets)
     assert found.active.all()
-    assert min(each.slack(found.anchor) for each in sets) >= LEAST
+    assert min(constraint_set.slack(found.anchor) for constraint_set in sets) >= LEAST
     hidden = Ball(t(0.8, -0.05), t(0.1)[0])
     found = lexicographic_anchor([BOUNDS, hidden, visible])
     assert found.active.tolist() == [True, False, True]

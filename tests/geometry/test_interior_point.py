@@ -30,7 +30,9 @@ def program(chosen: list[ConstraintSet]) -> Program:
     """Return the problem of the most slack in all sets."""
     bounds = chosen[0]
     assert isinstance(bounds, Box)
-    stacked = Program.stack([part for each in chosen if (part := each.superlevel())], bounds)
+    stacked = Program.stack(
+        [part for constraint_set in chosen if (part := constraint_set.superlevel())], bounds
+    )
     width = len(stacked.rows) - 2 * len(stacked.reach) + len(stacked.cones)
     every = np.ones((width, len(bounds.low)), dtype=bool)
     return stacked.requiring(0.0 * every, every, every)
@@ -45,7 +47,7 @@ def close(lower: Array, upper: Array, index: Index) -> Flags:
 def test_bounds_hold_on_the_way_and_close_in(kinds: tuple[int, ...]) -> None:
     """At each step the lower bound is an action's slack, and no random action beats the upper."""
     dim = 4
-    chosen = [each for i, each in enumerate(sets(dim)) if i in kinds]
+    chosen = [constraint_set for i, constraint_set in enumerate(sets(dim)) if i in kinds]
     intersection = Intersection.of(chosen)
     start = 0.5 * torch.randn(1, dim).double().numpy()
     rows = np.ones((1, sum(intersection.widths)), dtype=bool)
@@ -57,10 +59,15 @@ def test_bounds_hold_on_the_way_and_close_in(kinds: tuple[int, ...]) -> None:
 
     best = intersection.maximize(0.0 * rows, rows, rows, start, watched)
     found = torch.from_numpy(best.action)
-    slack = torch.stack([each.slack(found) for each in chosen]).amin()
+    slack = torch.stack([constraint_set.slack(found) for constraint_set in chosen]).amin()
     assert slack.item() == pytest.approx(best.slack.item(), abs=1e-7)
     around = found + torch.logspace(-6, 0, 5000).double().unsqueeze(-1) * torch.randn(5000, dim)
-    reached = torch.stack([each.slack(around) for each in chosen]).amin(0).amax().item()
+    reached = (
+        torch.stack([constraint_set.slack(around) for constraint_set in chosen])
+        .amin(0)
+        .amax()
+        .item()
+    )
     assert all(reached <= upper for _, upper in seen)
     assert all(lower <= best.upper_bound.item() for lower, _ in seen)
     assert best.upper_bound.item() - best.slack.item() <= 1e-7
@@ -80,7 +87,7 @@ def test_the_scaling_of_cones() -> None:
 
 def test_rows_that_do_not_count_change_nothing() -> None:
     everything, chosen = sets(3), [True, False, True, False, True]
-    kept = [each for each, on in zip(everything, chosen, strict=True) if on]
+    kept = [constraint_set for constraint_set, on in zip(everything, chosen, strict=True) if on]
     results = []
     for some, counts in ((everything, chosen), (kept, [True] * 3)):
         intersection = Intersection.of(some)
@@ -109,11 +116,11 @@ def test_what_is_required_is_kept() -> None:
 def test_descriptions_agree_with_the_slack(case: Case) -> None:
     batch = case.sets.batch_shape
     index = torch.arange(batch.numel())
-    chosen = [each.select(batch, index) for each in (case.bounds, case.sets)]
+    chosen = [part.select(batch, index) for part in (case.bounds, case.sets)]
     problem = program(chosen)
     for direction in case.directions(20, torch.float64):
         action = (case.inside + 2 * direction).expand(*batch, -1).reshape(len(index), -1)
-        expected = torch.minimum(*(each.slack(action) for each in chosen))
+        expected = torch.minimum(*(constraint_set.slack(action) for constraint_set in chosen))
         given = torch.from_numpy(problem.slack(action.numpy()))
         if case.convex:
             torch.testing.assert_close(given, expected, rtol=1e-9, atol=1e-9 * case.size)

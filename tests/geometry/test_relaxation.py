@@ -51,8 +51,8 @@ def actions_of(sets: list[ConstraintSet], found: Anchored, count: int = 2000) ->
 
 def kept(sets: list[ConstraintSet], found: Anchored, action: Tensor) -> bool:
     """Tell whether actions are in all sets, widened by no more than what is published."""
-    for each, amount in zip(sets, found.relaxation, strict=True):
-        slack = each.to(torch.float64).row_slacks(action.double())
+    for constraint_set, amount in zip(sets, found.relaxation, strict=True):
+        slack = constraint_set.to(torch.float64).row_slacks(action.double())
         if not bool((slack >= -amount.double() * (1 + 1e-7)).all()):
             return False
     return True
@@ -170,7 +170,7 @@ def test_actions_of_any_unit_behave_alike(unit: float, dtype: torch.dtype) -> No
     ):
         bounds = [Box(BOUNDS.low * u, BOUNDS.high * u) for u in (1.0, unit)]
         base, scaled = (
-            [each.to(dtype) for each in (box, *make(u))]
+            [constraint_set.to(dtype) for constraint_set in (box, *make(u))]
             for box, u in zip(bounds, (1.0, unit), strict=True)
         )
         expected, found = lexicographic_anchor(base), lexicographic_anchor(scaled)
@@ -215,11 +215,11 @@ def test_sets_at_any_distance_give_way(distance: float, dtype: torch.dtype) -> N
     center = t([distance, 0.0], [0.0, -distance], [0.3, 0.2])
     balls = Ball(center, number(0.5)).to(dtype)
     rows = HalfSpaces(t([1.0, 0.0]), -t([distance], [-1.0], [0.0])).to(dtype)
-    for each in (balls, rows):
-        sets = [BOUNDS.to(dtype), each]
+    for constraint_set in (balls, rows):
+        sets = [BOUNDS.to(dtype), constraint_set]
         found = lexicographic_anchor(sets)
         assert found.anchor.isfinite().all()
-        assert found.active[..., 1].tolist() == [False, each is rows, True]
+        assert found.active[..., 1].tolist() == [False, constraint_set is rows, True]
         assert found.largest()[0, 1].item() == pytest.approx(distance, rel=1e-3)
         bijector = ExactSquash(Region(tuple(sets), *found))
         action, log_det = bijector.forward_and_log_det(torch.randn(50, 3, 2).to(dtype))

@@ -171,16 +171,16 @@ def test_a_region_without_an_anchor_has_sets_but_no_gauges() -> None:
 
 def test_sets_without_interior_are_sets() -> None:
     zero = t(0.0)[0]
-    for each in (
+    for constraint_set in (
         Box(t(0.5, -1.0), t(0.5, 1.0)),
         Ball(t(0.0, 0.0), zero),
         TaskSpaceBall(t([1.0, 0.0]), t(0.0), zero),
         WeightedL1Ball(t(1.0, 1.0), zero),
         PositivePart(t(1.0, 0.0), zero),
     ):
-        assert each.slack(t(0.5, 0.5)).isfinite()
-        wider = each.inflated(t(0.25))
-        assert wider.contains(t(0.5, 0.0) if isinstance(each, Box) else t(0.0, 0.0))
+        assert constraint_set.slack(t(0.5, 0.5)).isfinite()
+        wider = constraint_set.inflated(t(0.25))
+        assert wider.contains(t(0.5, 0.0) if isinstance(constraint_set, Box) else t(0.0, 0.0))
 
 
 @pytest.mark.parametrize("event_dims", [None, {"radius": 0}, {"center": 0, "radius": 0}])

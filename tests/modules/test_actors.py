@@ -125,7 +125,9 @@ def test_networks_are_shared(
 ) -> None:
     actor = make_tanh_actor()
     constrained = constrain(actor, bijectors=bijectors)
-    assert [id(each) for each in constrained.parameters()] == [id(p) for p in network.parameters()]
+    assert [id(parameter) for parameter in constrained.parameters()] == [
+        id(p) for p in network.parameters()
+    ]
     before = actor(state.clone())["loc"]
     constrained(state.clone())["action"].sum().backward()
     for parameter in constrained.parameters():
@@ -241,7 +243,9 @@ def test_a_policy_that_shares_its_body_with_a_critic(
     constrained = constrain(actor, bijectors=bijectors)
     expected, got = act(actor, unbound), act(constrained, unbound)
     torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=2 * EROSION)
-    assert {id(each) for each in constrained.parameters()} == {id(p) for p in actor.parameters()}
+    assert {id(parameter) for parameter in constrained.parameters()} == {
+        id(p) for p in actor.parameters()
+    }
 
 
 def test_an_actor_with_named_modules(
@@ -325,7 +329,7 @@ def test_two_statements_are_refused(
     with pytest.raises(ValueError, match=f"^{stated}: "):
         make(given, env, **{stated: second[stated]})
     assert flow_head(make(given, env, order=["battery", "obstacle"])).order == [
-        each.name for each in bijectors
+        bijector.name for bijector in bijectors
     ]
 
 
@@ -468,7 +472,7 @@ def test_a_network_is_called_as_tensordicts_module_calls_it() -> None:
     ours = ParameterNetwork(both, in_keys=["x"], out_keys=["loc", "scale"])
     theirs = TensorDictModule(both, in_keys=["x"], out_keys=["loc", "scale"])
     x = torch.randn(4, 3)
-    expected, given = (each(TensorDict({"x": x}, batch_size=4)) for each in (theirs, ours))
+    expected, given = (policy(TensorDict({"x": x}, batch_size=4)) for policy in (theirs, ours))
     assert set(given.keys()) == set(expected.keys())
     for key in expected.keys():  # noqa: SIM118 - a tensordict iterates over its batch
         assert torch.equal(given[key], expected[key])

@@ -73,7 +73,7 @@ def test_chained_modules_score_as_the_distribution_of_the_chain(keys: tuple[str,
     state = published(**names)
     latent = torch.randn(BATCH, DIM, dtype=torch.float64)
     base = Independent(Normal(torch.zeros_like(latent), torch.ones_like(latent)), 1)
-    flow = ConstrainedFlow(base, SquashChain([each.get_transform(state) for each in modules]))
+    flow = ConstrainedFlow(base, SquashChain([module.get_transform(state) for module in modules]))
 
     state[sample_key] = latent
     for module in modules:
@@ -122,7 +122,7 @@ def test_a_family_without_a_squash_can_be_read_but_not_pushed_through() -> None:
 @pytest.mark.parametrize("order", [None, ["a", "b", "c"], ["c", "a", "b"], ("b", "c", "a")])
 def test_order_is_that_of_the_names(order: Sequence[str] | None) -> None:
     bijectors = [ConstraintBijector(name, Box) for name in "abc"]
-    names = [each.name for each in in_order(bijectors, order)]
+    names = [bijector.name for bijector in in_order(bijectors, order)]
     assert names == list(order or "abc")
     assert set(in_order(bijectors, order)) == set(bijectors)
 

@@ -247,8 +247,8 @@ def test_the_stage_of_a_constraint_is_inside_its_set(
         head = flow_head(make_actor(order=order))
         bijector = head.get_bijector(state.expand(500, *state.shape))
         actions = bijector.stages(3 * torch.randn(500, 8, 2)).actions
-        for stage, each in enumerate(head.get_region(state).sets):
-            assert each.contains(actions[stage:]).all()
+        for stage, constraint_set in enumerate(head.get_region(state).sets):
+            assert constraint_set.contains(actions[stage:]).all()
 
 
 def test_random_acts_on_noise_and_not_on_the_network(

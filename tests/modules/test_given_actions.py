@@ -77,7 +77,7 @@ def test_on_and_beyond_the_boundary_it_is_finite(
     inside = dist.bijector.contains(scored.action)
     assert inside.all()
     scored.log_prob.mean().backward()
-    gradients = [each.grad for each in actor.parameters()]
+    gradients = [parameter.grad for parameter in actor.parameters()]
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert any(gradient.abs().max() > 0 for gradient in gradients)
 

@@ -46,7 +46,7 @@ def test_without_constraints_the_same_count_is_not_zero() -> None:
     assert all(count > 100 for count in row.drops.values())
 
 
-@pytest.mark.parametrize("name", [name for name, each in experiment.NETWORKS.items() if each])
+@pytest.mark.parametrize("name", [name for name, change in experiment.NETWORKS.items() if change])
 def test_networks_are_as_hostile_as_their_names(name: str) -> None:
     hostile = experiment.NETWORKS[name]
     network = experiment.HostileNetwork(hostile)

@@ -64,7 +64,7 @@ def test_gradients_reach_output_nominal_and_fields(with_nominal: bool) -> None:
 
     output, nominal = torch.randn(2, 5, 2, dtype=torch.float64).unbind()
     offsets = 0.3 + torch.rand(5, 2, dtype=torch.float64)
-    given = [each.requires_grad_() for each in (output, offsets, nominal)]
+    given = [leaf.requires_grad_() for leaf in (output, offsets, nominal)]
     if not with_nominal:
         given[2] = nominal.detach()
     assert torch.autograd.gradcheck(act, given)

@@ -159,7 +159,7 @@ def test_copies_count_alone(make_actor: MakeActor, state: TensorDictBase) -> Non
     copies = copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))
     policy(state.clone())
     assert policy.frames_left == 12
-    assert [each.frames_left for each in copies] == [20, 20]
+    assert [twin.frames_left for twin in copies] == [20, 20]
     policy.frames_left = 20
     assert policy.frames_left == 20
 

@@ -315,7 +315,7 @@ def test_training_goes_as_with_torchrl_s(make_any_actor: MakeActor, batch: Tenso
     losses = both(actor, CRITICS["perceptron"]())
     ours = both(copy.deepcopy(actor), CRITICS["perceptron"]())[1]
     ours.load_state_dict(losses[0].state_dict())
-    states = [trained(each, batch).state_dict() for each in (losses[0], ours)]
+    states = [trained(loss, batch).state_dict() for loss in (losses[0], ours)]
     assert list(states[0]) == list(states[1])
     for key, expected in states[0].items():
         torch.testing.assert_close(states[1][key], expected, rtol=1e-2, atol=1e-3, msg=key)
@@ -395,11 +395,11 @@ def test_stacked_networks_are_the_networks(
         for parameter in member.parameters():
             nn.init.normal_(parameter)
     weights = {
-        name: torch.stack([dict(each.named_parameters())[name] for each in members])
+        name: torch.stack([dict(member.named_parameters())[name] for member in members])
         for name, _ in network.named_parameters()
     }
     given = torch.randn(*batch, inputs, requires_grad=True)
-    expected, mine = torch.stack([each(given) for each in members]), stacked(given, weights)
+    expected, mine = torch.stack([member(given) for member in members]), stacked(given, weights)
     torch.testing.assert_close(mine, expected)
     direction = torch.randn_like(expected)
     theirs = torch.autograd.grad((expected * direction).sum(), given)

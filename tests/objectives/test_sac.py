@@ -210,9 +210,9 @@ def test_the_reference_leaves_the_retractions_out(
     actor = make_actor(flow="gauge")  # whose share has the plain formula
     reference = with_reference_entropy(actor)
     drawn = []
-    for each in (actor, reference):
+    for policy in (actor, reference):
         torch.manual_seed(1)
-        drawn.append(each.get_dist(transitions.clone()).rsample_and_log_prob())
+        drawn.append(policy.get_dist(transitions.clone()).rsample_and_log_prob())
     (action, log_prob), (same_action, reference_log_prob) = drawn
     assert torch.equal(action, same_action)
 
@@ -229,7 +229,7 @@ def test_log_prob_is_the_true_density_with_either(
 ) -> None:
     actor = make_actor()
     densities = [
-        each.get_dist(transitions.clone()) for each in (actor, with_reference_entropy(actor))
+        policy.get_dist(transitions.clone()) for policy in (actor, with_reference_entropy(actor))
     ]
     action = densities[0].sample().clone()  # not the tensor that was drawn, scored by its latent
     assert torch.equal(densities[1].log_prob(action), densities[0].log_prob(action))
@@ -248,7 +248,7 @@ def test_the_loss_rewards_the_entropy_that_was_chosen(
         )
         for entropy in ("reference", "action")
     }
-    entropies = {name: evaluated(each, transitions)["entropy"] for name, each in losses.items()}
+    entropies = {name: evaluated(loss, transitions)["entropy"] for name, loss in losses.items()}
     default = ConstrainedSACLoss(actor, critic, action_spec=env.action_spec_unbatched)
     plain = SACLoss(actor, critic, action_spec=env.action_spec_unbatched)
     assert torch.equal(evaluated(default, transitions)["entropy"], entropies["reference"])

@@ -180,17 +180,19 @@ def test_values_and_gradients_are_those_of_the_formulas(
     assert float(losses["lambda_0"]) == pytest.approx(2.0)
     assert float(losses["lambda_1"]) == pytest.approx(torch.tensor(-0.5).exp().item())
 
-    parameters = {name: each for name, each in loss.named_parameters() if each.requires_grad}
+    parameters = {
+        name: parameter for name, parameter in loss.named_parameters() if parameter.requires_grad
+    }
     for name in LOSSES:
         mine, theirs = (
             torch.autograd.grad(
-                each[name],
+                result[name],
                 list(parameters.values()),
                 retain_graph=True,
                 allow_unused=True,
                 materialize_grads=True,
             )
-            for each in (losses, expected)
+            for result in (losses, expected)
         )
         for key, a, b in zip(parameters, mine, theirs, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5, msg=f"{name}: {key}")
@@ -345,6 +347,11 @@ def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDict
 
 
 # Settings -----------------------------------------------------------------------------------------
+
+
+def test_one_threshold_is_that_of_all_constraints(make_loss: MakeLoss) -> None:
+    loss = make_loss(thresholds=0.3, constraint_names=["obstacle", "battery"])
+    assert loss.thresholds.tolist() == pytest.approx([0.3, 0.3])
 
 
 @pytest.mark.parametrize(

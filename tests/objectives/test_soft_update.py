@@ -45,10 +45,10 @@ def disturb(loss: SACLoss, seed: int) -> None:
 def test_it_is_torchrl_s(loss: SACLoss, options: dict[str, float]) -> None:
     other = copy.deepcopy(loss)
     updaters = FusedSoftUpdate(loss, **options), SoftUpdate(other, **options)
-    for each, updater in zip((loss, other), updaters, strict=True):
-        disturb(each, 0)
+    for trained, updater in zip((loss, other), updaters, strict=True):
+        disturb(trained, 0)
         updater.step()
-        disturb(each, 1)
+        disturb(trained, 1)
         updater.step()
     state, expected = loss.state_dict(), other.state_dict()
     followed = [key for key in state if key.startswith(TARGETS)]
@@ -83,7 +83,7 @@ def test_targets_follow_after_the_loss_was_moved_or_loaded(
 def test_the_loss_knows_its_updater(loss: SACLoss, recwarn: pytest.WarningsRecorder) -> None:
     FusedSoftUpdate(loss, tau=0.5)
     assert loss.target_qvalue_network_params is not None
-    assert not [each for each in recwarn if "target" in str(each.message)]
+    assert not [warning for warning in recwarn if "target" in str(warning.message)]
 
 
 def test_both_or_neither_of_the_shares_are_refused(loss: SACLoss) -> None:

@@ -29,7 +29,7 @@ MakeConfig = Callable[..., DictConfig]
 def run(request: pytest.FixtureRequest, make_config: MakeConfig, tmp_path: Path) -> RunFolder:
     """A run of hardly any training: its policy knows nothing of any constraint."""
     folder = RunFolder.create(tmp_path / "run")
-    episodes = [each for each in TINY if "max_steps" not in each and "episodes" not in each]
+    episodes = [key for key in TINY if "max_steps" not in key and "episodes" not in key]
     train(make_config(*episodes, "evaluation.episodes=40", f"flow={request.param}"), folder)
     return folder
 
@@ -38,8 +38,8 @@ def test_an_untrained_flow_keeps_constraints_that_appear_later(run: RunFolder) -
     config = run.load_config()
     results = evaluate_afterwards(run)
     assert set(results) == set(CHANGES)
-    for each in results.values():
-        for outcome in each.both:
+    for result in results.values():
+        for outcome in result.both:
             assert (outcome.episodes, outcome.steps) == (40, 4000)
             if config.flow._target_.split(".")[-1] == "ExactFlow":
                 assert outcome.violations == {"obstacle": 0, "battery": 0}
@@ -70,7 +70,7 @@ def test_every_part_of_the_task_has_the_changed_map(name: str, make_config: Make
     expected = CHANGES[name](Layout())
     env = build_environment(new, batch_size=[2])
     found = [env.base_env.layout]
-    found += [each.layout for each in env.transform if hasattr(each, "layout")]
+    found += [transform.layout for transform in env.transform if hasattr(transform, "layout")]
     assert len(found) == 3
     assert found == [expected] * 3
     assert instantiate(new.env.baselines, _convert_="all")

@@ -45,8 +45,8 @@ def judged(by: Callable[[], Finding]) -> Verdict:
 def scored(*scores: float) -> list[Record]:
     """Return runs with these scores."""
     return [
-        changed(make_record(seed=seed), evaluation=make_evaluation(each))
-        for seed, each in enumerate(scores)
+        changed(make_record(seed=seed), evaluation=make_evaluation(score))
+        for seed, score in enumerate(scores)
     ]
 
 
@@ -127,7 +127,7 @@ def test_comparison_with_others(
     is_higher: Verdict,
     is_at_least: Verdict,
 ) -> None:
-    named: dict[str, Sequence[Record]] = {f"{i}": scored(*each) for i, each in enumerate(others)}
+    named: dict[str, Sequence[Record]] = {f"{i}": scored(*other) for i, other in enumerate(others)}
     assert judged(lambda: higher(scored(*mine), named, score)) is is_higher
     assert judged(lambda: at_least(scored(*mine), named, score)) is is_at_least
 
@@ -182,7 +182,7 @@ def test_speed(
     ],
 )
 def test_fall_of_violations(methods: list[list[tuple[float, float]]], verdict: Verdict) -> None:
-    assert falls({f"{i}": falling(*each) for i, each in enumerate(methods)}).verdict is verdict
+    assert falls({f"{i}": falling(*method) for i, method in enumerate(methods)}).verdict is verdict
 
 
 @pytest.mark.parametrize(
@@ -201,8 +201,8 @@ def test_a_higher_score_with_similar_violations(
     mine: Sequence[float], end: float, verdict: Verdict
 ) -> None:
     def with_end(runs: list[Record], *ends: float) -> list[Record]:
-        curves = falling(*((20, each) for each in ends))
-        return [changed(run, curves=each.curves) for run, each in zip(runs, curves, strict=True)]
+        curves = falling(*((20, end) for end in ends))
+        return [changed(run, curves=drawn.curves) for run, drawn in zip(runs, curves, strict=True)]
 
     other = with_end(scored(0.6, 0.61, 0.62), 1, 2, 3)
     runs = with_end(scored(*mine), *(end + i for i in range(len(mine))))

@@ -64,7 +64,7 @@ def test_runs_without_an_evaluation_after_a_change() -> None:
 
 def test_every_method_of_the_library_has_a_look_of_its_own() -> None:
     looks = LABELS.values()
-    assert len({each.color for each in looks}) == len({each.marker for each in looks}) == len(looks)
+    assert len({look.color for look in looks}) == len({look.marker for look in looks}) == len(looks)
     known = {path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml")}
     assert known & set(LABELS) >= {"exact", "squash", "penalty", "lagrangian", "unconstrained"}
     assert in_order(["unconstrained", "penalty_small", "mine", "exact", "penalty"]) == [

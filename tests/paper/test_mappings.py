@@ -18,7 +18,9 @@ RADIUS = torch.tensor(0.8, dtype=torch.float64)
 def webs(figure: Figure, panel: int) -> int:
     """Return of how many pieces the web in a panel is."""
     axes = figure.axes[panel]
-    web = next(each for each in axes.collections if isinstance(each, LineCollection))
+    web = next(
+        collection for collection in axes.collections if isinstance(collection, LineCollection)
+    )
     return len(web.get_segments())
 
 
@@ -34,7 +36,7 @@ def test_particles_land_in_the_set(draws: Callable[[Figure], bool]) -> None:
     titles = [axes.get_title() for axes in figure.axes[:4]]
     assert titles == ["before: z ~ N(0, I)", "ball", "box", "shell"]
     before, *after = (axes.collections[-1].get_offsets() for axes in figure.axes[:4])
-    assert len({len(each) for each in (before, *after)}) == 1
+    assert len({len(shown) for shown in (before, *after)}) == 1
     assert ball.contains(torch.as_tensor(after[0])).all()
     assert (torch.as_tensor(after[2]).norm(dim=-1) > RADIUS / 4).all()
     # The shell tears the lines through the origin; the others tear none.

@@ -63,7 +63,7 @@ def test_estimates_and_what_is_said_without_one(draws: Callable[[Figure], bool])
     assert [label.get_text() for label in axes.get_yticklabels()] == ["first", "second", "third"]
     assert [text.get_text() for text in axes.texts] == ["never"]
     ends = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2]
-    assert (0.8, 1.3) in [tuple(each) for each in ends]
+    assert (0.8, 1.3) in [tuple(end) for end in ends]
     assert draws(figure)
 
 

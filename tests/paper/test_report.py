@@ -41,8 +41,8 @@ def verdicts(
 ) -> dict[int, tuple[str, ...]]:
     """Return the words of each verdict by number, one for each flow that it is about."""
     return {
-        each.number: tuple(each.verdict(flow).strip("*") for flow in each.found)
-        for each in judge(Evidence(runs, hostile))
+        judgment.number: tuple(judgment.verdict(flow).strip("*") for flow in judgment.found)
+        for judgment in judge(Evidence(runs, hostile))
     }
 
 
@@ -103,7 +103,7 @@ def test_one_violation_of_a_hostile_network_turns_the_verdict() -> None:
 
 @pytest.mark.parametrize("method", ["squash", "projection", "penalty", "lagrangian"])
 def test_a_missing_baseline_leaves_the_aim_untested(method: str) -> None:
-    runs = {name: each for name, each in make_runs(2).items() if name != method}
+    runs = {name: record for name, record in make_runs(2).items() if name != method}
     assert verdicts(runs)[FIRST_AIM + 1] == ("not tested",)
 
 
@@ -124,8 +124,8 @@ def test_report_is_written_and_repeated(tmp_path: Path) -> None:
     assert write_report(tmp_path) == tmp_path / "README.md"
     page, details = ((tmp_path / name).read_text() for name in ("README.md", "details.md"))
     shown = set(re.findall(r"\]\(images/(.*?)\)", page))
-    assert shown == {each.name for each in (tmp_path / "images").iterdir()}
-    assert all(is_a_picture(tmp_path / "images" / each) for each in shown)
+    assert shown == {path.name for path in (tmp_path / "images").iterdir()}
+    assert all(is_a_picture(tmp_path / "images" / name) for name in shown)
     assert set(re.findall(r"\(details\.md#(.*?)\)", page)) <= anchors(details)
     assert set(re.findall(r"\(README\.md#(.*?)\)", details)) <= anchors(page)
     assert str(tmp_path) not in page + details

@@ -49,7 +49,7 @@ def test_a_run_is_done_once_and_its_record_says_what_it_left(
     assert problems == []
 
     attempt = folder / "attempt_2"
-    assert sorted(each.name for each in folder.iterdir()) == ["attempt_1", "attempt_2"]
+    assert sorted(path.name for path in folder.iterdir()) == ["attempt_1", "attempt_2"]
     summary = json.loads((attempt / "summary.json").read_text())
     assert (record.method, record.seed, record.steps) == ("unconstrained", 3, 192)
     assert record.overrides == ("a=1",)
@@ -138,7 +138,7 @@ def test_the_commit_is_known_only_in_a_checkout(
 
 def sweep(output: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "experiments.paper.run", f"hydra.sweep.dir='{output}'"]
-    tiny = [each for each in TINY if not each.startswith("figures")]
+    tiny = [key for key in TINY if not key.startswith("figures")]
     return subprocess.run(
         [*command, *tiny, *overrides], cwd=ROOT, capture_output=True, text=True, check=False
     )

@@ -13,7 +13,7 @@ from cnfp_torchrl.commands.sweep_folders import (
     config_arguments,
     planned_runs,
     run_name,
-    sweep_arguments,
+    with_common_keys,
 )
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.sweep import OVERRIDES, Mean, read_sweep, varied
@@ -186,6 +186,8 @@ def test_long_names_are_cut_and_stay_apart() -> None:
 
 def test_what_all_runs_have_in_common_is_not_in_the_names() -> None:
     arguments = ["-m", "seed=0,1", "flow=exact", "+env.base.max_steps=3", "optim.lr=choice(1,2)"]
-    (added,) = sweep_arguments(arguments)
-    assert added.endswith("exclude_keys=['flow','env.base.max_steps']")
-    assert sweep_arguments(["seed=0"]) == []
+    added = "hydra.job.config.override_dirname.exclude_keys=['flow','env.base.max_steps']"
+    assert with_common_keys(arguments) == [*arguments[:4], added, arguments[4]]
+    # Hydra's parser takes overrides in one row alone, with options on either side.
+    assert with_common_keys([*arguments[1:], "-m"]) == [*arguments[1:4], added, arguments[4], "-m"]
+    assert with_common_keys(["seed=0"]) == ["seed=0"]

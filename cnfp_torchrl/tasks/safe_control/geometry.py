@@ -8,14 +8,38 @@ in the accelerations.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
+from cnfp_torchrl.envs import GeometryTransform
 from cnfp_torchrl.geometry import HalfSpaces
 from cnfp_torchrl.tasks.safe_control.unicycle import Problem
 
 MARGIN = 1e-9
 """The share of a row's terms by which it is moved inwards: more than rounding in float64."""
+
+
+class BarrierGeometry(GeometryTransform):
+    """The accelerations that keep all barriers, as the half-spaces of `barrier_rows` in float32.
+
+    Args:
+        name: The constraint's name.
+        problem: The sizes; None takes the published ones.
+        kwargs: Further options of `GeometryTransform`.
+    """
+
+    def __init__(
+        self, name: str = "barriers", problem: Problem | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(name, ["state"], **kwargs)
+        self.problem = Problem() if problem is None else problem
+
+    def constraint_set(self, tensordict: TensorDictBase) -> HalfSpaces:
+        """Return the half-spaces, one for each ellipse."""
+        return barrier_rows(self.problem, tensordict.get("state")).to(torch.float32)
 
 
 def barrier_rows(problem: Problem, state: Tensor) -> HalfSpaces:

@@ -53,11 +53,14 @@ class Costs(NamedTuple):
         cost: The integral of the weighted squares of states and controls.
         violations: The number of controls that broke a barrier, over all states.
         largest: The largest excess over a barrier.
+        excess: The integral of the excess over each barrier, ``(n, K)``: HardNet's own measure.
+            None without a judge.
     """
 
     cost: Tensor
     violations: int
     largest: float
+    excess: Tensor | None
 
 
 def starts(barrier: Callable[[Tensor], Tensor], count: int = 1000, seed: int = 17) -> Tensor:
@@ -100,6 +103,18 @@ def motion(state: Tensor, control: Tensor) -> Tensor:
     return torch.stack([speed * theta.cos(), speed * theta.sin(), turn, *control.unbind(-1)], -1)
 
 
+def encoded(state: Tensor) -> Tensor:
+    """Return what a network sees of a state: the heading as cosine and sine, ``(*batch, 6)``."""
+    theta = state[..., 2:3]
+    return torch.cat([state[..., :2], theta.cos(), theta.sin(), state[..., 3:]], -1)
+
+
+def step_cost(problem: Problem, state: Tensor, control: Tensor) -> Tensor:
+    """Return the cost of a unit of time, the weighted squares of state and control."""
+    q, r = (state.new_tensor(w) for w in (problem.state_weights, problem.control_weights))
+    return (q * state.square()).sum(-1) + (r * control.square()).sum(-1)
+
+
 def episode(
     problem: Problem,
     state: Tensor,
@@ -117,8 +132,8 @@ def episode(
         most: The cost from which an episode costs no more.
         judge: The excess over each barrier of controls in their states, ``(n, K)``.
     """
-    q, r = (state.new_tensor(w) for w in (problem.state_weights, problem.control_weights))
     cost, violations, largest = state.new_zeros(len(state)), 0, 0.0
+    integral: Tensor | None = None
     for _ in range(round(problem.duration / problem.dt)):
         # Above `most` the step's costs do not count, all of them or none.
         counts = (cost.detach() < most).to(state.dtype)
@@ -133,11 +148,13 @@ def episode(
                 step = torch.minimum(problem.dt * problem.largest / fastest, left)
                 runs = left > 0
                 if judge is not None:
-                    excess = judge(state, control)[runs]
-                    violations += int((excess > 0).any(-1).sum())
-                    largest = max(largest, float(excess.max()))
+                    excess = judge(state, control)
+                    violations += int((excess[runs] > 0).any(-1).sum())
+                    largest = max(largest, float(excess[runs].max()))
+                    broken = step.unsqueeze(-1) * excess.relu()
+                    integral = broken if integral is None else integral + broken
                 left = left - step
-            spent = spent + step * ((q * state.square()).sum(-1) + (r * control.square()).sum(-1))
+            spent = spent + step * step_cost(problem, state, control)
             state = state + step.unsqueeze(-1) * motion(state, control)
         cost = cost + counts * spent
-    return Costs(cost, violations, largest)
+    return Costs(cost, violations, largest, integral)

@@ -11,7 +11,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.envs import can_render
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.rerun import style
-from cnfp_torchrl.visual.rerun.painters import HEIGHTS_IN_ONE, legend_size
+from cnfp_torchrl.visual.rerun.painters import HEIGHTS_IN_ONE, axis_room, legend_size
 from cnfp_torchrl.visual.rerun.series import Plot, flow_plots, task_plots
 from cnfp_torchrl.visual.rerun.style import (
     EXPLANATION,
@@ -116,7 +116,7 @@ def _map() -> rrb.Spatial2DView:
         name="Map",
         background=rrb.Background(color=style.BACKGROUND),
         # In half widths of the map, as it is drawn.
-        visual_bounds=rrb.VisualBounds2D(x_range=[-1.04, 1.04], y_range=[-1.04, 1.04]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-1.04, 1.04], y_range=_with_axes([-1.04, 1.04])),
     )
 
 
@@ -143,8 +143,16 @@ def _stage(setting: Setting, view: StageView) -> rrb.Spatial2DView:
         contents=f"/{stage_path(setting, view)}/**",
         name=view.title,
         background=rrb.Background(color=style.BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[-reach, reach], y_range=heights),
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[-reach, reach], y_range=_with_axes(heights, len(setting.rows()))
+        ),
     )
+
+
+def _with_axes(heights: Sequence[float], rows: int = 1) -> list[float]:
+    """Return heights, from the top, with room for the axes' titles above and below."""
+    room = axis_room(rows)
+    return [heights[0] - room, heights[1] + room]
 
 
 def _plot(plot: Plot) -> rrb.TimeSeriesView:

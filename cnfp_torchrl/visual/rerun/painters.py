@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -11,13 +12,13 @@ from numpy.typing import NDArray
 from rerun.components import ImageFormat
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, Shape
+from cnfp_torchrl.envs import Boxes, Component, Discs, Map, Marks, Polyline, Shape
 from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.rerun import entities, style
 from cnfp_torchrl.visual.rerun.entities import Entities
 from cnfp_torchrl.visual.scene import Scene
-from cnfp_torchrl.visual.setting import Setting, StageView
+from cnfp_torchrl.visual.setting import Setting, StageView, axis_title
 
 _TRACKS = 40
 _TARGETS = 160
@@ -32,6 +33,29 @@ _BOUNDS = (-0.42, 1.05)
 
 _LEGEND_COLUMNS = 3
 _COLUMN_WIDTH, _ROW_HEIGHT = 3.3, 0.62
+
+
+def axis_room(rows: int) -> float:
+    """Return the height of an axis's title, in half widths of what the view shows.
+
+    Titles have one size on the screen, however many rows of views share it.
+    """
+    return 0.16 * min(rows, 3)
+
+
+def _log_axes(
+    drawn: Entities, titles: Sequence[str], positions: Sequence[tuple[float, float]]
+) -> None:
+    """Log the titles of the axes, below the frame and above it: Rerun's views have none.
+
+    Args:
+        drawn: where to log.
+        titles: of the axis to the right and, if there is one, of that upwards.
+        positions: the upper ends of the titles.
+    """
+    labels = [f"{arrow} {title}" for arrow, title in zip("→↑", titles, strict=False)]
+    points = rr.Points2D(positions, labels=labels, colors=style.MUTED, radii=0.0, show_labels=True)
+    drawn.style("axes", points)
 
 
 class PlanePainter:
@@ -96,6 +120,9 @@ class PlanePainter:
         self._entities.style("", upright)
         corners = np.array([low, (high[0], low[1]), high, (low[0], high[1]), low])
         self._entities.style("bounds", rr.LineStrips2D.from_fields(strips=[corners]))
+        titles = [setting.axis_title(component) for component in chosen]
+        above = y + (setting.reach + axis_room(len(setting.rows()))) * half[1]
+        _log_axes(self._entities, titles, [(x, low[1]), (x, above)])
 
     def _log_density_style(self, setting: Setting, cells: int) -> None:
         (x_low, x_high), (y_low, y_high) = setting.support
@@ -185,6 +212,7 @@ class LinePainter:
         low, high = self._middle - self._half, self._middle + self._half
         frame = [_post(low), _post(high), np.array([(low, 0.0), (high, 0.0)])]
         self._entities.style("bounds", rr.LineStrips2D.from_fields(strips=frame))
+        _log_axes(self._entities, [setting.axis_title(0)], [(self._middle, HEIGHTS_IN_ONE[0])])
         for name, archetypes in style.stage_styles(self._stage).items():
             self._entities.style(name, *archetypes)
         lines = rr.LineStrips2D.from_fields
@@ -242,6 +270,12 @@ class MapPainter:
         # The first axis to the right, the second one upwards, the longer side from -1 to 1.
         middle = [-x / half, y / half, 0] if x or y else None
         self._entities.style("", rr.Transform3D(translation=middle, scale=[1 / half, -1 / half, 1]))
+        titles = [
+            axis_title(Component(name, self._map.unit), limits)
+            for name, limits in (("x", self._map.x), ("y", self._map.y))
+        ]
+        above = self._map.y[1] + axis_room(1) * half
+        _log_axes(self._entities, titles, [(x, self._map.y[0]), (x, above)])
         for shape in self._map.shapes:
             self._log_shape(shape, rgb(shape.color_on_dark or shape.color))
 
@@ -309,7 +343,7 @@ def log_legend(stream: rr.RecordingStream, setting: Setting) -> None:
     positions = [
         (
             _COLUMN_WIDTH * (0.5 + i % _LEGEND_COLUMNS),
-            _ROW_HEIGHT * (0.35 + i // _LEGEND_COLUMNS),
+            _ROW_HEIGHT * (0.2 + i // _LEGEND_COLUMNS),
         )
         for i in range(len(entries))
     ]

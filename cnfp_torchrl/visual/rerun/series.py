@@ -44,7 +44,7 @@ def flow_plots(setting: Setting) -> list[Plot]:
         plots.append(Plot("moved", f"Moved by ({setting.unit})", constraints, is_apart=True))
     if constraints:
         allowed = {"all constraints": style.PALE}
-        plots.append(Plot("allowed", "Allowed before the flow (% of samples)", allowed, (0, 100)))
+        plots.append(Plot("allowed", "Allowed before the flow (% of samples)", allowed, (0, 104)))
         title = f"Relaxed by ({setting.unit})"
         plots.append(Plot("relaxation", title, constraints, is_apart=True))
     if setting.costs:

@@ -69,7 +69,7 @@ class Agent:
             F32(p + F32(lay.step_length) * F32(min(max(a, F32(-1)), F32(1))))
             for p, a in zip(self.place, action, strict=True)
         ]
-        hit = any(touches(self.place, wanted, each) for each in lay.rectangles)
+        hit = any(touches(self.place, wanted, rectangle) for rectangle in lay.rectangles)
         out = any(abs(exact(w)) > exact(lay.wall) for w in wanted)
         if not ((hit or out) and self.collision == "block"):
             self.place = [F32(min(max(w, F32(-lay.wall)), F32(lay.wall))) for w in wanted]

@@ -182,9 +182,9 @@ def test_its_state_travels() -> None:
         return torch.cat([state["observation"], each.reset()["observation"]])
 
     expected = future(env)
-    for each in copies:
-        assert each.steps.tolist() == [10, 10, 10] or each is env
-        assert torch.equal(future(each), expected)
+    for twin in copies:
+        assert twin.steps.tolist() == [10, 10, 10] or twin is env
+        assert torch.equal(future(twin), expected)
 
 
 def test_constraint_names_are_readable_through_transforms() -> None:

@@ -73,7 +73,10 @@ class Walker:
         self.least_safe_slack = torch.minimum(self.least_safe_slack, self._slack(box, ball, safe))
         self.least_slack = torch.minimum(self.least_slack, self._slack(box, ball, anchor))
         gauge = torch.stack(
-            [each.eroded().gauge(direction, anchor) for each in (BOUNDS, box, ball)]
+            [
+                constraint_set.eroded().gauge(direction, anchor)
+                for constraint_set in (BOUNDS, box, ball)
+            ]
         ).amax(0)
         action = anchor + direction * (share / gauge).unsqueeze(-1)
         action = torch.where(self.counted.unsqueeze(-1), action, 0.0)
@@ -83,7 +86,9 @@ class Walker:
         self.violations += self.state["cost"][self.counted].sum(0)
 
     def _slack(self, box: Box, ball: Ball, action: Tensor) -> Tensor:
-        slack = torch.stack([each.slack(action) for each in (BOUNDS, box, ball)]).amin(0)
+        slack = torch.stack(
+            [constraint_set.slack(action) for constraint_set in (BOUNDS, box, ball)]
+        ).amin(0)
         return slack[self.counted].min()
 
 

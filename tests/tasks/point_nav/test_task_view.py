@@ -76,7 +76,7 @@ def test_the_map_is_the_layouts() -> None:
     layout = Layout(rectangles=((-0.6, -0.6, -0.2, -0.3), (0.1, -0.2, 0.5, 0.5)))
     view = find_task_view(PointNavEnv(layout=layout))
     assert isinstance(view.map, Map)
-    (boxes,) = (each for each in view.map.shapes if isinstance(each, Boxes))
+    (boxes,) = (shape for shape in view.map.shapes if isinstance(shape, Boxes))
     assert boxes.boxes == layout.rectangles
     assert view.map.step_length == layout.step_length
 

@@ -18,7 +18,9 @@ from cnfp_torchrl.tasks.robots import PowerLimit, RateLimit, RobotEnv, robot_wit
 from cnfp_torchrl.training.agent import build_actor, build_environment
 
 TASKS = sorted(
-    path.stem for path in config_directory().glob("env/*.yaml") if path.stem != "point_nav"
+    path.stem
+    for path in config_directory().glob("env/*.yaml")
+    if path.stem not in ("point_nav", "safe_control")
 )
 
 

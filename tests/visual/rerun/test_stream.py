@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from cnfp_torchrl import constrain_env
+from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.explanation import explain
@@ -67,6 +68,22 @@ def test_any_flow_in_any_action_space(case: str, flow: str, tmp_path: Path) -> N
         at = executed[step][-1, :shown]
         np.testing.assert_array_equal(at, transition["action"][:2].numpy())
         assert len(executed[step]) == len(stages) + 1
+
+
+@pytest.mark.parametrize(
+    ("sets", "dim", "view", "titles"),
+    [
+        (LINE, 1, "3\\ ball", ["→ a1, -1 to 1"]),
+        (PLANE, 2, "2\\ battery", ["→ a1, -1 to 1", "↑ a2, -1 to 1"]),
+        (SPACE, 3, "1\\ bounds/a2\\,\\ a3", ["→ a2, -1 to 1", "↑ a3, -1 to 1"]),
+    ],
+)
+def test_axes_have_names_and_ends(
+    sets: dict[str, ConstraintSet], dim: int, view: str, titles: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "recording.rrd"
+    record_steps(path, sets, dim=dim)
+    assert read(path, f"/stages/{view}/axes", "Points2D:labels")[-1].tolist() == titles
 
 
 def test_samples_density_and_explanation_are_the_policys(tmp_path: Path) -> None:

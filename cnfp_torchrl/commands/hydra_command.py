@@ -1,0 +1,85 @@
+"""Commands that Hydra configures: any path on their command line, and errors in a sentence."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import TypeVar
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from cnfp_torchrl.commands.paths import quoted_paths
+from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, errors_in_a_sentence, write_error
+from cnfp_torchrl.configuration import config_directory
+
+R = TypeVar("R")
+
+
+def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[], None]]:
+    """Return a decorator that makes a command of a function of a configuration.
+
+    The command takes ``run=PATH`` and ``resume=PATH`` with any path. Where it fails, the cause
+    comes first, in one line; in a sweep, as soon as the run has failed.
+
+    Args:
+        name: The configuration's name in ``conf/``.
+    """
+
+    def decorate(function: Callable[[DictConfig], R]) -> Callable[[], None]:
+        @wraps(function)
+        def run(config: DictConfig) -> R:
+            if is_sweep():
+                return _run_of_sweep(function, config)
+            # Not left to Hydra, which prints the overrides before the cause.
+            with errors_in_a_sentence():
+                return function(config)
+
+        application = hydra.main(
+            config_path=str(config_directory()), config_name=name, version_base="1.3"
+        )(run)
+
+        @wraps(function)
+        def command() -> None:
+            sys.argv[1:] = quoted_paths(sys.argv[1:])
+            with errors_in_a_sentence(), _raised_by_hydra():
+                application()
+
+        return command
+
+    return decorate
+
+
+def is_sweep() -> bool:
+    """Tell whether the job that runs is one of a sweep."""
+    return bool(HydraConfig.get().mode == RunMode.MULTIRUN)
+
+
+def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
+    """Call a function, and write at once why it fails: Hydra tells of one failure, at the end."""
+    try:
+        return function(config)
+    except Exception as error:
+        folder = Path(HydraConfig.get().runtime.output_dir).name
+        # Not the end of the process, which would be that of the sweep.
+        raise CompactHydraException(write_error(error, f"{folder}: ")) from error
+
+
+@contextmanager
+def _raised_by_hydra() -> Iterator[None]:
+    """Let Hydra raise its errors in this context, where it would print them and exit."""
+    if WITH_TRACEBACKS:
+        yield
+        return
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        del os.environ["HYDRA_FULL_ERROR"]
