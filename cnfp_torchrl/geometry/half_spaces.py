@@ -144,7 +144,9 @@ class HalfSpaces(ConstraintSet):
         return moved
 
     def _keep(self, rows: Rows) -> None:
-        object.__setattr__(self, "_kept", rows)
+        # A compiler sees by itself what is computed twice.
+        if not torch.compiler.is_compiling():
+            object.__setattr__(self, "_kept", rows)
 
 
 def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:

@@ -141,13 +141,15 @@ class BrakeAtWalls(GeometryTransform):
         return HalfSpaces(normals, 4 * (1 - position) - 6 * speed, validate_args=False)
 
 
-def environments(task: str, agents: int) -> tuple[EnvBase, TransformedEnv]:
+def environments(
+    task: str, agents: int, *, compile: bool = False
+) -> tuple[EnvBase, TransformedEnv]:
     """Return the plain and the constrained environment of a task."""
     if task == "own":
         limits = SpeedLimit("speed"), BrakeAtWalls("walls")
-        return Particle(agents), constrain_env(Particle(agents), *limits)
+        return Particle(agents), constrain_env(Particle(agents), *limits, compile=compile)
     plain, base = (PointNavEnv([agents], seed=0) for _ in range(2))
-    return plain, constrain_env(base, BatteryGeometry(), ObstacleGeometry())
+    return plain, constrain_env(base, BatteryGeometry(), ObstacleGeometry(), compile=compile)
 
 
 def network(env: EnvBase) -> nn.Module:
@@ -169,6 +171,9 @@ def time_steps(task: str, batches: list[int], settings: Settings) -> dict[str, R
             "plain": Replay(plain, recorded, start),
             "constrained": Replay(env, recorded, start),
         }
+        if not settings.quick:
+            _, compiled = environments(task, agents, compile=True)
+            calls["constrained, compiled"] = Replay(compiled, recorded, start)
         times = settings.timed(calls)
         results[f"{task}, step, batch {agents}"] = compared(times, "plain", agents)
     return results

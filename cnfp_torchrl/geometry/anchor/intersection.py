@@ -39,13 +39,12 @@ class Intersection:
     plain: tuple[int, ...]
 
     @classmethod
-    def of(cls, sets: Sequence[ConstraintSet], near: Array | None = None) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet], widths: Sequence[int] | None = None) -> Self:
         """Describe sets of batch shape ``(B,)`` in any dtype, on any device.
 
         Args:
             sets: the first is the finite box of action bounds.
-            near: of non-convex sets the parts near these points count, ``(B, d)``; None means those
-                that `ConstraintSet.superlevel` describes.
+            widths: number of rows of each set; None counts them.
 
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
@@ -58,11 +57,10 @@ class Intersection:
             for name, field in constraint_set.fields().items():
                 if np.isnan(field.detach().numpy()).any():
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
-        middle = (bounds.low + bounds.high) / 2
-        widths = tuple(
-            int(s.row_slacks(middle).shape[-1]) if type(s).has_rows() else 1 for s in wide
-        )
-        return cls._described(wide, widths, near)
+        if widths is None:
+            slacks = [s.row_slacks(bounds.low) if type(s).has_rows() else None for s in wide]
+            widths = [1 if slack is None else slack.shape[-1] for slack in slacks]
+        return cls._described(wide, tuple(widths), None)
 
     def near(self, point: Array) -> Self:
         """Return the intersections with the convex parts near points ``(B, d)`` in their place."""

@@ -90,6 +90,8 @@ class PointNavGeometry(GeometryTransform):
         """Return the way to the nearest station, which both constraints of a state ask for."""
         global _last_way
         observation, layout = tensordict.get(self.in_keys[0]), self.layout
+        if torch.compiler.is_compiling():
+            return self.path.to_station(read_position(tensordict, self.in_keys[0]))
         known = _last_way
         if known is not None and known.is_of(observation, layout):
             return known.way
