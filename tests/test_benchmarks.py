@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -50,6 +52,22 @@ def test_updates_and_training_are_timed_and_tabulated(tmp_path: Path) -> None:
         assert 0 < row["low"] <= row["ratio"] <= row["high"]
         assert f"| {row['ratio']:.2f} |" in text
     assert update["rows"]["Stable-Baselines3"]["ratio"] == 1
+
+
+@pytest.mark.slow
+def test_layers_are_timed_and_judged(tmp_path: Path) -> None:
+    script = ROOT / "experiments" / "benchmarks" / "layers.py"
+    arguments = ["--quick", "--skip", "qpax", "pinet", "--output", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    document = json.loads((tmp_path / "layers.json").read_text())
+    assert "qpax" in document["about"]["not measured"]
+    for rows in document["results"].values():
+        assert rows["exact"]["ratio"] == 1
+        for name in ("exact", "gauge", "soft", "soft, anchor searched", "SRad, dense Jacobian"):
+            assert rows[name]["broken, %"] == 0
+            assert rows[name]["ms, both"] > 0
+    rows = document["results"]["Eight rows in six dimensions, 4 states"]
+    assert rows["Dykstra, 50 rounds"]["broken, %"] > 0
 
 
 def test_what_is_measured_on_a_gpu_is_tabulated(tmp_path: Path) -> None:
