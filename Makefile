@@ -48,13 +48,13 @@ test-rounding: $(STAMP) ## Repeat the numeric tests with PyTorch's kernels for o
 bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 minutes)
 	$(PY) experiments/benchmarks/flows.py $(ARGS)
 
-bench-anchors: $(STAMP) ## Time anchors beside the flow and qpax's projection (some 2 minutes)
+bench-anchors: $(STAMP) ## Time anchors beside the flow and qpax's projection (some 3 minutes)
 	$(PY) experiments/benchmarks/anchor_times.py $(ARGS)
 
 bench-layers: $(STAMP) ## Time layers beside solvers, and count what each leaves broken (some 2 minutes)
 	$(PY) experiments/benchmarks/layers.py $(ARGS)
 
-bench-lines: $(STAMP) ## Time steps, paths, flows and anchors, a line each (ARGS="--line NAME")
+bench-lines: $(STAMP) ## Time steps, paths and flows, a line each (ARGS="--line NAME")
 	$(PY) experiments/benchmarks/lines.py $(ARGS)
 
 bench-updates: $(STAMP) ## Time updates and training beside Stable-Baselines3 (some 10 minutes)

@@ -302,7 +302,7 @@ def _allowed(snapshot: FlowSnapshot) -> Tensor:
     """Tell which of many actions, spread evenly over the bounds, each set allows, ``(K, n)``."""
     bounds = snapshot.region.bounds
     spread = bounds.low + (bounds.high - bounds.low) * _evenly_spread(snapshot.dim).to(bounds.low)
-    allowed = [each.contains(spread) for each in snapshot.region.sets[1:]]
+    allowed = [constraint.contains(spread) for constraint in snapshot.region.sets[1:]]
     return torch.stack(allowed) if allowed else torch.ones(0, _DRAWS, dtype=torch.bool)
 
 

@@ -109,7 +109,7 @@ class Scene:
     @property
     def moved(self) -> Mapping[str, float | None]:
         """By how much each constraint moved the executed action, None where that is unknown."""
-        return {each.name: each.moved for each in self.explanation.constraints}
+        return {effect.name: effect.moved for effect in self.explanation.constraints}
 
     def samples(self, stage: int, components: Sequence[int]) -> Floats:
         """Return components of all samples after a stage, ``(n, m)``."""
@@ -195,10 +195,10 @@ class Scene:
         assert self.log_density is not None
         values = self.log_density.numpy()
         heights = np.exp(np.minimum(values - _top(values), 0.0))
-        return [np.stack([self.actions[:, 0].numpy(), each], axis=-1) for each in heights]
+        return [np.stack([self.actions[:, 0].numpy(), curve], axis=-1) for curve in heights]
 
     def on_map(self, targets: int) -> SetsOnMap | None:
-        """Return the sets of actions in place, with some samples; None without a map.
+        """Return the sets and some samples at the agent's position; None for a task without a map.
 
         Args:
             targets: number of samples.
@@ -209,7 +209,7 @@ class Scene:
             return None
         state = self.snapshot.state
         position = view.position(state).tolist()
-        place, goal = np.array(position), view.goal(state)
+        origin, goal = np.array(position), view.goal(state)
         sets: list[list[Line]] = []
         dropped: list[list[Line]] = []
         allowed: list[Line] = []
@@ -217,25 +217,25 @@ class Scene:
         if plane.step_length is not None and self.setting.dim == 2:
             step, limits = plane.step_length, _reachable(plane, position, plane.step_length)
             seen = self._seen((0, 1))
-            for k, each in enumerate(self.snapshot.region.sets[1:], start=1):
+            for k, constraint in enumerate(self.snapshot.region.sets[1:], start=1):
                 boundary = seen.of_set(k)
                 inside = [] if boundary is None else within(boundary, limits)
                 traced = []
                 if boundary is None:
-                    traced = set_outline(each, limits, self.detail.nodes)
-                sets.append([place + step * line for line in inside])
-                dropped.append([place + step * line for line in traced])
+                    traced = set_outline(constraint, limits, self.detail.nodes)
+                sets.append([origin + step * line for line in inside])
+                dropped.append([origin + step * line for line in traced])
             whole = seen.of_intersection(range(len(self.snapshot.region.sets)))
-            allowed = [place + step * line for line in within(whole, limits)]
+            allowed = [origin + step * line for line in within(whole, limits)]
             moves = step * samples.numpy()
         executed = moves[self.snapshot.followed] if len(moves) else np.zeros(2, dtype=np.float32)
         return SetsOnMap(
-            place,
+            origin,
             None if goal is None else goal.tolist(),
             sets,
             dropped,
             allowed,
-            place + moves[1 : 1 + targets],
+            origin + moves[1 : 1 + targets],
             executed,
         )
 

@@ -115,7 +115,7 @@ class FlowSnapshot:
     def contained(self) -> Tensor:
         """Which samples of the last stage each set contains, dropped ones too, ``(K + 1, n)``."""
         samples = self.stages[-1].samples
-        return torch.stack([each.contains(samples) for each in self.region.sets])
+        return torch.stack([allowed.contains(samples) for allowed in self.region.sets])
 
     @cached_property
     def share_allowed_before(self) -> float:
@@ -232,7 +232,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
 
     latents = loc + scale * noise.to(loc)
     latent_log_density = base.log_prob(latents).cpu()
-    actions, log_dets = (each.cpu() for each in staged.forward(latents))
+    actions, log_dets = (values.cpu() for values in staged.forward(latents))
     on_host = region.to(device="cpu")
     stages = tuple(
         Stage(
@@ -269,7 +269,9 @@ def _as_applied(
     if state.get(ANCHOR_KEY, None) is not None:
         region = head.get_region(state)
     else:
-        region = Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
+        region = Region.build(
+            [head.bounds, *(bijector.get_set(state) for bijector in head.bijectors)]
+        )
     active = [True] * len(region.sets) if region.active is None else region.active.tolist()
     sets, relaxation = list(region.sets), [0.0 if flag else torch.inf for flag in active]
     if head.flow.is_safe and region.relaxation is not None:
@@ -302,13 +304,13 @@ class StagedFlow:
         if self._is_one:
             # To an exact flow, a set not yet applied is one that is not active.
             holds = torch.tensor(
-                [[k in each for k in range(len(region.sets))] for each in applied],
+                [[k in so_far for k in range(len(region.sets))] for so_far in applied],
                 device=region.anchor.device,
             )
             active = holds if region.active is None else holds & region.active
             self._bijectors = [flow(Region(region.sets, region.anchor, active.unsqueeze(1)))]
         else:
-            self._bijectors = [stage_bijector(flow, region, each) for each in applied]
+            self._bijectors = [stage_bijector(flow, region, so_far) for so_far in applied]
 
     @property
     def last(self) -> Bijector:
@@ -328,7 +330,7 @@ class StagedFlow:
         """
         if self._is_one:
             return self._each_stage(*self.last.inverse_and_log_det(actions))
-        found = [each.inverse_and_log_det(actions) for each in self._bijectors]
+        found = [bijector.inverse_and_log_det(actions) for bijector in self._bijectors]
         latents, log_dets = zip(*found, strict=True)
         return torch.stack(latents), torch.stack(log_dets)
 

@@ -68,7 +68,7 @@ def openness(region: Region) -> tuple[Tensor, Tensor]:
     ray = torch.randn(_DIRECTIONS, 1, region.anchor.shape[-1], generator=generator)
     ray = ray.to(region.anchor)
     gauges = torch.stack(
-        torch.broadcast_tensors(*(each.gauge(ray, region.anchor) for each in region.sets))
+        torch.broadcast_tensors(*(allowed.gauge(ray, region.anchor) for allowed in region.sets))
     )
     gauges = torch.where(region.is_active.movedim(-1, 0).unsqueeze(1), gauges, 0.0)
     outer, inner = gauges[0], gauges.amax(0)

@@ -30,7 +30,7 @@ RELAXATIONS = {
 }
 """What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
 
-_WORDS = {"qvalue": "critic", "alpha": "α"}
+_LOSSES = {"qvalue": "critic", "alpha": "α"}
 _TITLES = {"alpha": "entropy coefficient α", "entropy": "policy entropy (nats)"}
 _COLUMNS = 4
 
@@ -66,8 +66,8 @@ def learning_curves(
 ) -> Figure:
     """Draw return, cumulative violations by constraint, and whatever else was logged of learning.
 
-    How constraints gave way is drawn where one did. What was not logged is said in its panel; a run
-    without any scalars gives a figure that says so.
+    Relaxations are drawn where a constraint was relaxed. A panel without a curve says why; so does
+    the figure of a run without any scalars.
 
     Args:
         curves: steps and values by name, see `read_scalars`.
@@ -124,7 +124,7 @@ def learning_curves(
 def _title(name: str) -> str:
     group, _, last = name.rpartition("/")
     if group == "loss" and last != "entropy":
-        return f"{_WORDS.get(last, last)} loss"
+        return f"{_LOSSES.get(last, last)} loss"
     return _TITLES.get(last, last.replace("_", " "))
 
 

@@ -285,8 +285,8 @@ def _stage_title(snapshot: FlowSnapshot, index: int) -> str:
         head += (
             " (dropped here)" if not snapshot.is_active(stage.applied[-1]) else " (relaxed here)"
         )
-    told = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
-    return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {told}"
+    fault = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
+    return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {fault}"
 
 
 def _legend(scene: Scene, colors: Mapping[str, str]) -> list[Line2D]:

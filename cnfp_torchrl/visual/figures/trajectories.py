@@ -164,7 +164,7 @@ def _scale(view: TaskView, episodes: Sequence[Episode]) -> Normalize | None:
         return None
     if view.series[0].limits is not None:
         return Normalize(*view.series[0].limits)
-    levels = np.concatenate([each.levels for each in episodes if each.levels is not None])
+    levels = np.concatenate([episode.levels for episode in episodes if episode.levels is not None])
     return Normalize(float(levels.min()), float(levels.max()))
 
 

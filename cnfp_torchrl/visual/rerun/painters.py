@@ -83,20 +83,20 @@ class PlanePainter:
 
     def log(self, scene: Scene) -> None:
         """Log one step."""
-        entities_, stage, components = self._entities, self._stage, self._components
+        drawn, stage, components = self._entities, self._stage, self._components
         snapshot, samples = scene.snapshot, scene.samples(stage, components)[1:]
         # Exact flows stay inside after every stage; what is executed is looked at all the same.
         looked_at = self._is_last or not snapshot.is_safe
         outside = snapshot.outside(stage)[1:].numpy() if looked_at else np.zeros(0, dtype=bool)
         if scene.heat is not None:
-            entities_.log("density", entities.pixels(scene.heat[stage]))
+            drawn.log("density", entities.pixels(scene.heat[stage]))
         if stage > 0:
-            entities_.lines("way_from_stage_before", scene.tracks(stage, components, _TRACKS))
+            drawn.lines("way_from_stage_before", scene.tracks(stage, components, _TRACKS))
         any_outside = bool(outside.any())
-        entities_.points("samples", samples[~outside] if any_outside else samples)
-        entities_.points("samples_outside", samples[outside] if any_outside else samples[:0])
+        drawn.points("samples", samples[~outside] if any_outside else samples)
+        drawn.points("samples_outside", samples[outside] if any_outside else samples[:0])
         self._log_sets(scene)
-        entities_.path("executed", scene.path(stage, components))
+        drawn.path("executed", scene.path(stage, components))
 
     def _log_sets(self, scene: Scene) -> None:
         applied, components = scene.snapshot.stages[self._stage].applied, self._components
@@ -135,8 +135,8 @@ class PlanePainter:
             draw_order=-20,
             magnification_filter="linear",
         )
-        place = rr.Transform3D(translation=[x_low, y_low, 0], scale=cell)
-        self._entities.style("density", place, image)
+        transform = rr.Transform3D(translation=[x_low, y_low, 0], scale=cell)
+        self._entities.style("density", transform, image)
 
     def _log_styles(self, setting: Setting, color: style.Color) -> None:
         for name, archetypes in style.stage_styles(self._stage).items():

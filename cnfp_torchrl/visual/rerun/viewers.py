@@ -16,6 +16,8 @@ import rerun_cli
 from cnfp_torchrl.visual.rerun.follow import Address, is_listening
 
 LOOPBACK = "127.0.0.1"
+WEB_PORT, PORT = 9090, 9876
+"""The usual ports of the web viewer's page, and of recordings."""
 
 _PATIENCE_S = 5.0
 """How long a viewer that listens may take to answer, on a machine that is busy with training."""
@@ -141,8 +143,8 @@ class WebViewer(Viewer):
 
     def __init__(
         self,
-        web_port: int = 9090,
-        port: int = 9876,
+        web_port: int = WEB_PORT,
+        port: int = PORT,
         host: str = LOOPBACK,
         memory_limit: str = "256MiB",
     ) -> None:
@@ -154,7 +156,8 @@ class WebViewer(Viewer):
     def url(self) -> str:
         """The page to open in a browser."""
         source = quote(f"rerun+http://{self.host}:{self.port}/proxy", safe="")
-        return f"http://{self.host}:{self.web_port}/?url={source}"
+        # Dark, as views and curves are meant to be seen; else the browser's own theme is taken.
+        return f"http://{self.host}:{self.web_port}/?url={source}&theme=dark"
 
     def require(self) -> None:
         if self.web_port == self.port:
@@ -194,7 +197,7 @@ class ViewerWindow(Viewer):
         port: int | None = None,
         arguments: Sequence[str] = (),
     ) -> None:
-        super().__init__(LOOPBACK, _free_port() if port is None else port)
+        super().__init__(LOOPBACK, free_port() if port is None else port)
         self._memory_limit, self._arguments = memory_limit, list(arguments)
 
     def require(self) -> None:
@@ -236,7 +239,13 @@ def _require_free(name: str, host: str, port: int) -> None:
         ) from None
 
 
-def _free_port() -> int:
+def free_port(preferred: int = 0) -> int:
+    """Return a port of loopback that is free: the preferred one, or any."""
+    try:
+        _require_free("port", LOOPBACK, preferred)
+    except SinkError:
+        preferred = 0
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((LOOPBACK, preferred))
         return int(probe.getsockname()[1])
