@@ -39,6 +39,9 @@ FLOWS = {
 }
 """Our methods, by the flow of ``conf/flow`` that each is."""
 
+OURS = ("hard", "soft")
+"""Those of them that are bijections; the others are baselines."""
+
 PEER = "sb3_projection"
 """Stable-Baselines3's SAC, whose actions the environment projects."""
 

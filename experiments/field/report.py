@@ -24,6 +24,8 @@ from experiments.field.jobs import (
     DATA,
     FOLDER,
     METHODS,
+    ONE_SEED,
+    OURS,
     RANDOM_ACTIONS,
     SAFE_CONTROL,
     TRAINED,
@@ -149,7 +151,30 @@ def training_table(records: Sequence[Record], task: str) -> list[str]:
             f"{median(run.projections for run in chosen):,.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
+    return [*lines, "", *compared(records, task)]
+
+
+def compared(records: Sequence[Record], task: str) -> list[str]:
+    """Return a sentence on the best of ours and the best peer, by the median stochastic return."""
+    found: dict[bool, tuple[float, str]] = {}
+    for method, label in LABELS.items():
+        returns = [
+            float(np.mean(run.stochastic.returns))
+            for run in records
+            if (run.task, run.method) == (task, method)
+        ]
+        if returns and method not in ONE_SEED:
+            is_ours, result = method in OURS, (median(returns), label.text)
+            found[is_ours] = max(found.get(is_ours, result), result)
+    if len(found) < 2:
+        return []
+    (mine, my_name), (theirs, their_name) = found[True], found[False]
+    verdict = "at least that of" if mine >= theirs else "below"
+    return [
+        f"Of these runs, the best of ours by stochastic return ({my_name}) has {mine:,.0f}, {verdict} "
+        f"the best constrained peer's ({their_name}), {theirs:,.0f}.",
+        "",
+    ]
 
 
 def random_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -246,8 +271,15 @@ def results(data: Path, page: Path) -> str:
     lines: list[str] = []
     if records := read_records(data):
         draw(records, page.parent / "images" / "training.png")
-        steps, about = {run.steps for run in records}, records[0].about
-        devices = sorted({f"{run.about['machine']}, {run.about['device']}" for run in records})
+        steps = {run.steps for run in records}
+        made_with = sorted(
+            {
+                "torch {torch}, TorchRL {torchrl}, MuJoCo {mujoco}; {machine}, {device}".format(
+                    **run.about
+                )
+                for run in records
+            }
+        )
         lines += [
             "## Training",
             "",
@@ -262,8 +294,7 @@ def results(data: Path, page: Path) -> str:
             "machine; steps a second those of training, other runs beside it.",
             "",
             *(line for task in TRAINED for line in training_table(records, task)),
-            f"torch {about['torch']}, TorchRL {about['torchrl']}, MuJoCo {about['mujoco']}; "
-            f"{'; '.join(devices)}; one thread a run.",
+            f"One thread a run: {' | '.join(made_with)}.",
             "",
         ]
     paths = [data / RANDOM_ACTIONS / f"{task}.json" for task in ACTION_SIZES]
