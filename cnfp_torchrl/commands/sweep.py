@@ -97,9 +97,9 @@ def resume(runs: Sequence[SweepRun], *, jobs: int, trusted: Sequence[str] = ()) 
     """Go on with the runs that are neither done nor running; yield a line for each when it ends.
 
     Args:
-        runs: the runs of a sweep.
-        jobs: number of runs at a time, each in a process of its own.
-        trusted: names that their configurations may use, as ``trusted`` of ``cnfp-train``.
+        runs: The runs of a sweep.
+        jobs: The number of runs at a time, each in a process of its own.
+        trusted: The names that their configurations may use, as ``trusted`` of ``cnfp-train``.
     """
 
     def go_on(run: SweepRun) -> str:
