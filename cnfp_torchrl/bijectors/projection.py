@@ -9,7 +9,12 @@ from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages
 from cnfp_torchrl.bijectors.squashes import BoxSquash
-from cnfp_torchrl.geometry import Region, project_onto_intersection, require_action_bounds
+from cnfp_torchrl.geometry import (
+    Region,
+    project_onto_intersection,
+    require_action_bounds,
+    settled,
+)
 
 
 class NoDensityError(NotImplementedError):
@@ -30,14 +35,15 @@ class Projection(Bijector):
     before the projection.
 
     Args:
-        region: regions of sets with closed-form projections, of batch shape ``(*batch,)``.
+        region: regions of batch shape ``(*batch,)``, of any shipped family.
         rounds: number of rounds of Dykstra's algorithm, >= 1.
         validate_args: whether to check the action bounds, which reads them on the host.
 
     Raises:
         ValueError: when there are no rounds.
         NoDensityError: when a density, an inverse or stages are asked for.
-        TypeError: on mapping, for a set without closed-form projection.
+        TypeError: on mapping, for a set of a family that says neither how it projects nor how it is
+            described (`ConstraintSet.superlevel`).
     """
 
     bijective = False
@@ -59,7 +65,7 @@ class Projection(Bijector):
     def forward_and_reference_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         bounded, log_det = self._box.forward_and_log_det(latent)
         closest = project_onto_intersection(self._region, bounded, self._rounds)
-        return self._region.pulled_in(closest), log_det
+        return settled(self._region, closest), log_det
 
     def contains(self, action: Tensor) -> Tensor:
         """Tell whether each action lies in the region, whose boundary is part of the image."""

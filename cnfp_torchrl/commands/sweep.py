@@ -16,6 +16,7 @@ from cnfp_torchrl.commands.extras import needs_extra
 with needs_extra("train"):
     from cnfp_torchrl.commands.paths import quoted
     from cnfp_torchrl.commands.refusals import errors_in_a_sentence
+    from cnfp_torchrl.commands.sweep_folders import config_arguments, planned_runs
     from cnfp_torchrl.text_table import text_table
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.sweep import SEED, Mean, SweepRun, over_seeds, read_sweep, varied
@@ -78,7 +79,7 @@ def _number(value: float | None) -> str:
 
 def report(folder: Path) -> str:
     """Write table, means and figure of a sweep into its folder, and return both tables as text."""
-    runs = read_sweep(folder)
+    runs = read_sweep(folder, planned_runs(folder))
     tables = {TABLE: run_rows(runs)}
     if SEED in varied(runs):
         tables[MEANS] = mean_rows(runs)
@@ -93,21 +94,21 @@ def report(folder: Path) -> str:
     return "\n\n".join([*parts, files])
 
 
-def resume(runs: Sequence[SweepRun], *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[str]:
+def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[str]:
     """Go on with the runs that are neither done nor running; yield a line for each when it ends.
 
     Args:
-        runs: The runs of a sweep.
+        folder: The sweep's folder.
         jobs: The number of runs at a time, each in a process of its own.
         trusted: The names that their configurations may use, as ``trusted`` of ``cnfp-train``.
     """
 
     def go_on(run: SweepRun) -> str:
-        if not RunFolder(run.path).has_started:
-            return f"{run.path}: never began ({run.reason}); start it anew"
-        arguments = [f"resume={quoted(str(run.path.absolute()))}"]
-        if trusted:
-            arguments.append(f"trusted=[{','.join(map(quoted, trusted))}]")
+        path = quoted(str(run.path.absolute()))
+        if RunFolder(run.path).has_started:
+            arguments = [f"resume={path}", f"trusted=[{','.join(map(quoted, trusted))}]"]
+        else:
+            arguments = [*config_arguments(folder), *run.given, f"hydra.run.dir={path}"]
         done = subprocess.run(
             [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
             stdout=subprocess.DEVNULL,
@@ -119,7 +120,8 @@ def resume(runs: Sequence[SweepRun], *, jobs: int, trusted: Sequence[str] = ()) 
             return f"{run.path}: done"
         return f"{run.path}: {RunFolder(run.path).load_failure() or done.stderr.strip()}"
 
-    unfinished = [run for run in runs if run.state in ("failed", "stopped")]
+    runs = read_sweep(folder, planned_runs(folder))
+    unfinished = [run for run in runs if run.state not in ("done", "running")]
     with ThreadPoolExecutor(jobs) as pool:
         yield from pool.map(go_on, unfinished)
 
@@ -140,8 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--jobs: expected a number >= 1, given {options.jobs}")
     with errors_in_a_sentence(parser.prog):
         if options.resume:
-            runs = read_sweep(options.folder)
-            for line in resume(runs, jobs=options.jobs, trusted=options.trusted):
+            for line in resume(options.folder, jobs=options.jobs, trusted=options.trusted):
                 sys.stdout.write(f"{line}\n")
         sys.stdout.write(f"{report(options.folder)}\n")
 

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 LONGEST = 80
 """Characters of a folder's name; the number before it keeps names apart that are cut."""
+
+MULTIRUN = "multirun.yaml"
+"""What Hydra writes of a sweep into its folder."""
 
 STARTED: list[Path] = []
 """The folders of the sweeps that this process has started."""
@@ -59,6 +65,46 @@ def _short(value: str) -> str:
 
 # In every process that runs a job: Hydra sends callbacks there, and with them this module.
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def planned_runs(folder: Path) -> dict[Path, list[str]]:
+    """Return the overrides of all runs of a sweep, by the folders that Hydra would give them.
+
+    A study decides while it goes on which runs it has: of it nothing is known.
+    """
+    path = folder / MULTIRUN
+    if not path.is_file():
+        return {}
+    settings = yaml.safe_load(path.read_text(encoding="utf-8"))["hydra"]
+    if not settings["sweeper"]["_target_"].endswith(".BasicSweeper"):
+        return {}
+    always = [f"{key}={value}" for key, value in (settings["sweeper"]["params"] or {}).items()]
+    choices = {}
+    parser = OverridesParser.create()
+    for override in parser.parse_overrides([*always, *settings["overrides"]["task"]]):
+        if isinstance(override.value(), Glob):
+            return {}  # means what it finds, which may have changed
+        key = override.get_key_element()
+        if override.is_sweep_override():
+            values = list(override.sweep_string_iterator())
+        else:
+            values = [override.get_value_element_as_str()]
+        choices[key] = [f"{key}={value}" for value in values]
+    constant = settings["job"]["config"]["override_dirname"]["exclude_keys"]
+    runs = map(list, product(*choices.values()))
+    return {
+        folder / run_name(i, overrides, constant): overrides for i, overrides in enumerate(runs)
+    }
+
+
+def config_arguments(folder: Path) -> list[str]:
+    """Return the arguments by which a sweep was told of configurations of one's own."""
+    path = folder / MULTIRUN
+    if not path.is_file():
+        return []
+    sources = yaml.safe_load(path.read_text(encoding="utf-8"))["hydra"]["runtime"]["config_sources"]
+    given = [source["path"] for source in sources if source["provider"] == "command-line"]
+    return [part for directory in given for part in ("--config-dir", directory)]
 
 
 def with_common_keys(arguments: Sequence[str]) -> list[str]:

@@ -27,7 +27,7 @@ with needs_extra("train"):
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
     from cnfp_torchrl.training.resume import resumed_config
-    from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
+    from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
 
@@ -50,7 +50,7 @@ def _remove_unless_started(folder: RunFolder) -> None:
 
     Anything else in the folder stays, and the folder with it.
     """
-    if (folder.path / CONFIG).exists():
+    if folder.has_started:
         return
     log = folder.path / f"{HydraConfig.get().job.name}.log"
     if log.exists() and not log.stat().st_size:
@@ -120,6 +120,8 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
 def _main(config: DictConfig) -> float:
     """Train, draw the run's figures, print the summary, and return what a sweep maximizes."""
     folder, config = _folder_and_config(config)
+    # A sweep tells of its runs that were refused, also when they are tried again.
+    is_told = is_sweep() or folder.load_failure() is not None
     try:
         draw: Callable[[RunFolder], object] | None = instantiate(config.figures) or None
         summary = train(config, folder, resume=folder.has_started)
@@ -128,12 +130,11 @@ def _main(config: DictConfig) -> float:
         sys.exit(128 + stop.number)
     except Exception as error:
         # A complete run has not failed because it was asked to go on.
-        if (is_sweep() or folder.has_started) and not folder.is_complete:
+        if (is_told or folder.has_started) and not folder.is_complete:
             folder.save_failure(error)
         raise
     finally:
-        # A sweep tells of those that were refused.
-        if not is_sweep():
+        if not is_told:
             _remove_unless_started(folder)
     folder.forget_failure()
     sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
+from cnfp_torchrl.envs.compiled_geometry import CompiledGeometry, anchor_entries
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform, are_good
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
-from cnfp_torchrl.geometry import LEEWAY, Box, GeometryError, begin_anchor, finish_anchor
+from cnfp_torchrl.geometry import LEEWAY, Begun, Box, GeometryError, begin_anchor, finish_anchor
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
     ActionBounds,
@@ -65,6 +66,9 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             None takes the bijectors' own order. The same as the flow's.
         leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
             smallest width of the action bounds.
+        compile: Whether the geometries right before this transform, their checks and the cheap part
+            of the anchor are compiled into one function (`torch.compile`), which steps use; resets
+            do without. `constraint_set` must then read the entries of its `in_keys` alone.
 
     Raises:
         TypeError: when a bijector is none, or the order is a string; at a reset, for a collector's
@@ -80,6 +84,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         bijectors: Sequence[ConstraintBijector],
         order: Sequence[str] | None = None,
         leeway: float = LEEWAY,
+        *,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         self._leeway = leeway
@@ -89,6 +95,10 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._bounds: ActionBounds | None = None
         # Those whose checks are settled here, looked up at the first step of an episode.
         self._geometries: list[GeometryTransform] | None = None
+        self._compiles = compile
+        # In use between resets; kept for the next episode, because it takes long to compile.
+        self._compiled: CompiledGeometry | None = None
+        self._known_program: CompiledGeometry | None = None
         # The last policy of a collector that was found to fit: each is examined once.
         self._fitting: Callable[[], nn.Module | None] = _no_policy
 
@@ -103,6 +113,31 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         return list(self._bijectors)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        batch = next_tensordict.batch_size
+        if self._compiled is not None:
+            begun, flags = self._compiled(next_tensordict)
+        else:
+            begun = self._begun(next_tensordict)
+            flags = begun.attempt.decided.all().unsqueeze(0)
+        if self._settled(next_tensordict, flags):
+            self._watch.all_held(batch.numel())
+            if self._compiled is not None:
+                return next_tensordict  # it has published that all sets hold
+            found = begun.all_held()
+        else:
+            if self._compiled is not None:
+                begun = begun._replace(sets=self._compiled.sets(next_tensordict))
+            found = finish_anchor(begun, self._leeway)
+            if self._watch.looks and bool(found.active.all()):
+                self._watch.all_held(batch.numel())
+            else:
+                self._watch(begun.sets, found.largest(), batch.numel())
+        for key, value in anchor_entries(found, self._bijectors, batch).items():
+            next_tensordict.set(key, value)
+        return next_tensordict
+
+    def _begun(self, next_tensordict: TensorDictBase) -> Begun:
+        """Begin to look for anchors by the sets in a tensordict."""
         bounds = self._action_bounds()
         # In the dtype of the actions, as the flow will see them.
         sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
@@ -115,57 +150,59 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        begun = begin_anchor([bounds, *sets], candidate)
-        batch = next_tensordict.batch_size
-        if self._settled(begun.attempt.decided.all()):
-            found = begun.all_held()
-            self._watch.all_held(batch.numel())
-        else:
-            found = finish_anchor(begun, self._leeway)
-            if self._watch.looks and bool(found.active.all()):
-                self._watch.all_held(batch.numel())
-            else:
-                self._watch([bounds, *sets], found.largest(), batch.numel())
-        next_tensordict.set(ANCHOR_KEY, _expanded(found.anchor, batch))
-        active = _expanded(found.active, batch).unbind(-1)
-        for stage, bijector in enumerate(self._bijectors, start=1):
-            rows = _expanded(found.relaxation[stage], batch)
-            largest = rows.squeeze(-1) if rows.shape[-1] == 1 else rows.amax(-1)
-            next_tensordict.set(bijector.active_key, active[stage])
-            next_tensordict.set(bijector.relaxation_key, largest)
-            if bijector.row_relaxation_key is not None:
-                next_tensordict.set(bijector.row_relaxation_key, rows)
-        return next_tensordict
+        return begin_anchor([bounds, *sets], candidate)
 
-    def _settled(self, decided: Tensor) -> bool:
+    def _settled(self, states: TensorDictBase, flags: Tensor) -> bool:
         """Settle the checks of all geometries, and tell whether all states are decided.
 
-        Their flags are read on the host together: on a GPU each read waits.
+        Flags are read on the host together: on a GPU each read waits.
+
+        Args:
+            states: The states.
+            flags: Whether all are decided and, where it is known, whether all values are good.
         """
         if self._geometries is None:
             appended = appended_transforms(self.container)
             before = takewhile(lambda transform: transform is not self, appended)
             self._geometries = [t for t in before if isinstance(t, GeometryTransform)]
         checks = [check for t in self._geometries if (check := t.pending_check())]
-        if not checks:
-            return bool(decided)
-        all_decided, good = torch.stack([decided, are_good(checks)]).tolist()
-        if not good:
+        if checks:
+            flags = torch.cat([flags, are_good(checks).unsqueeze(0)])
+        all_decided, *good = flags.tolist()
+        if not all(good):
             for check in checks:
                 check.refuse()
+            if self._compiled is not None:
+                self._compiled.refuse(states)
         return bool(all_decided)
+
+    def _compile(self) -> None:
+        """From now on let the geometries right before this transform be published by it."""
+        appended = appended_transforms(self.container)
+        before = reversed(list(takewhile(lambda transform: transform is not self, appended)))
+        geometries = list(takewhile(lambda t: isinstance(t, GeometryTransform), before))[::-1]
+        for geometry in geometries:
+            geometry.is_published_by_another = True
+        known, bounds = self._known_program, self._action_bounds()
+        if known is None or known.geometries != geometries or known.bounds is not bounds:
+            self._known_program = CompiledGeometry(geometries, self._bijectors, bounds)
+        self._compiled = self._known_program
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._refuse_unseen_steps()
         self._refuse_misfit_of_collector()
-        self._geometries = None
-        return self._call(tensordict_reset)
+        self._geometries, self._compiled = None, None
+        reset = self._call(tensordict_reset)
+        if self._compiles:
+            self._compile()
+        return reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Fill in anchor and flags of stored transitions, at root and under next."""
-        self._geometries = []  # in a replay buffer they settle their checks themselves
+        # In a replay buffer the geometries publish their sets and settle their checks themselves.
+        self._geometries, self._compiled = [], None
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
@@ -222,14 +259,15 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._fitting = weakref.ref(policy)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_fitting": _no_policy}
+        alone = {"_fitting": _no_policy, "_compiled": None, "_known_program": None}
+        return {**super().__getstate__(), **alone}
 
     def clone(self) -> Self:
         """Return a copy without environment, which keeps the action bounds of this one's."""
         if self.parent is not None:
             self._action_bounds()
         copy = super().clone()
-        copy._geometries = None
+        copy._geometries = copy._compiled = copy._known_program = None
         return copy
 
     def _action_bounds(self, device: torch.device | None = None) -> Box:
@@ -243,8 +281,3 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
             self._bounds = ActionBounds(bounds)
         return self._bounds.on(device)
-
-
-def _expanded(value: Tensor, batch: torch.Size) -> Tensor:
-    """Return values ``(..., m)`` as ``(*batch, m)``."""
-    return value if value.shape[:-1] == batch else value.expand(*batch, value.shape[-1])

@@ -25,6 +25,7 @@ def constrain_env(
     order: Sequence[str] | None = None,
     with_anchor: bool = True,
     validate: bool | None = None,
+    compile: bool = False,
 ) -> TransformedEnv:
     """Return an environment that publishes the geometry of its constraints in every state.
 
@@ -42,6 +43,8 @@ def constrain_env(
             nothing (``squash``, ``unconstrained``) act without them, and steps take less time.
         validate: Whether the values that the geometries read and return are checked at each step,
             see `GeometryTransform`; None leaves that to each of them.
+        compile: Whether steps compute geometry and anchors by a compiled function, see
+            `ConstraintAnchor`. It takes some ten seconds to compile at the first step.
 
     Raises:
         TypeError: when the environment is no `EnvBase`, a geometry is no `GeometryTransform` (but
@@ -49,6 +52,11 @@ def constrain_env(
         ValueError: without geometries, for an action spec that is not one of vectors with bounds,
             or when an order does not name each constraint once.
     """
+    if compile and not with_anchor:
+        raise ValueError(
+            "compile: expected False with with_anchor=False, given True; the compiled function is "
+            "called by the transform that computes the anchor"
+        )
     if not isinstance(env, EnvBase):
         raise TypeError(
             f"env: expected a TorchRL environment, given {_kind(env)}; wrap one of Gymnasium's in "
@@ -76,7 +84,7 @@ def constrain_env(
     bijectors = [*before, *(own for geometry in geometries for own in geometry.bijectors)]
     ordered = in_order(bijectors, order)
     if with_anchor:
-        return published.append_transform(ConstraintAnchor(ordered))
+        return published.append_transform(ConstraintAnchor(ordered, compile=compile))
     if ordered != bijectors:
         raise ValueError(
             f"order: expected the constraints published before, {[g.name for g in before]}, "

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -77,6 +76,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
     _family: type[ConstraintSet] | None = None
     _is_compared = False
     _is_settled_by_another = False
+    is_published_by_another = False
+    """Whether a transform behind this one publishes the set, until the next reset."""
     _check: Check | None = None
     _valid_shapes: list[tuple[torch.Size, torch.dtype]] | None = None
 
@@ -148,8 +149,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             TypeError: when it is no `ConstraintSet`.
             GeometryError: for another family than before, and one that breaks the contract.
         """
-        with self._naming_the_constraint("constraint_set"):
-            allowed = self.constraint_set(tensordict)
+        allowed = self._own("constraint_set", self.constraint_set, tensordict)
         if type(allowed) is not self._family:
             self._refuse_what_is_no_set(allowed)
             self._family = type(allowed)
@@ -161,7 +161,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         Args:
             tensordict: States of any batch size; not changed.
         """
-        return self._entries(tensordict, self.checked_set(tensordict))
+        return self.published(tensordict, self.checked_set(tensordict))
 
     def _validated(self, allowed: ConstraintSet) -> ConstraintSet:
         try:
@@ -221,7 +221,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         state = observation_spec.zero()
         try:
             allowed = self.checked_set(state)
-            entries = self._entries(state, allowed)
+            entries = self.published(state, allowed)
             if state.numel():
                 self._refuse_what_follows_the_batch(state, allowed)
         except Exception as error:
@@ -243,13 +243,15 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Publish at the root and, where it exists, under ``next``: for use in a replay buffer."""
-        self._is_settled_by_another = False
+        self._is_settled_by_another = self.is_published_by_another = False
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.is_published_by_another:
+            return next_tensordict
         try:
             allowed = self.checked_set(next_tensordict)
         except Exception:
@@ -257,7 +259,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             raise
         if self.validate:
             self._check_values(next_tensordict, allowed)
-        entries = self._entries(next_tensordict, allowed)
+        entries = self.published(next_tensordict, allowed)
         if not self._is_compared and next_tensordict.numel() > 1:
             self._refuse_what_follows_the_batch(next_tensordict, allowed)
             self._is_compared = True
@@ -276,12 +278,11 @@ class GeometryTransform(Transform, ConstraintPublisher):
         return check
 
     def _check_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
-        inputs = [states.get(key) for key in self.in_keys]
         shapes = [(value.shape, value.dtype) for value in allowed.fields().values()]
         if shapes != self._valid_shapes:
             allowed.validate_shapes(self._where(allowed))
             self._valid_shapes = shapes
-        check = Check(inputs, allowed, partial(self._refuse_values, states, allowed))
+        check = self.check(states, allowed)
         if self._is_settled_by_another and self._check is None:
             self._check = check
             return
@@ -291,24 +292,41 @@ class GeometryTransform(Transform, ConstraintPublisher):
             if pending is not None and not bool(are_good([pending])):
                 pending.refuse()
 
+    def check(self, states: TensorDictBase, allowed: ConstraintSet) -> Check:
+        """Return what is to be checked of some states and their `checked_set`."""
+        inputs = {key: states.get(key) for key in self.in_keys}
+        return Check(inputs, allowed, partial(self._refuse_values, states, allowed))
+
     def _refuse_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
         self._refuse_what_is_not_finite(states)
         self._validated(allowed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions stay behind.
+        return {**super().__getstate__(), "is_published_by_another": False}
 
     def clone(self) -> Self:
         """Return a copy without environment, which settles its checks itself."""
         copy = super().clone()
         copy._check, copy._is_settled_by_another = None, False
+        copy.is_published_by_another = False
         return copy
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self.is_published_by_another = False
         return self._call(tensordict_reset)
 
-    def _entries(
+    def published(
         self, tensordict: TensorDictBase, allowed: ConstraintSet
     ) -> dict[tuple[str, ...], Tensor]:
+        """Return what is published in some states of their `checked_set`.
+
+        Args:
+            tensordict: States of any batch size; not changed.
+            allowed: The states' set.
+        """
         batch = tensordict.batch_size
         entries: dict[tuple[str, ...], Tensor] = {}
         for field, value in allowed.fields().items():
@@ -323,8 +341,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
                         f"broadcasts to {tuple(batch)}, given shape {tuple(value.shape)}"
                     ) from None
             entries[field_key(self.name, field)] = value.contiguous()
-        with self._naming_the_constraint("safe_action"):
-            action = self.safe_action(tensordict, allowed)
+        action = self._own("safe_action", self.safe_action, tensordict, allowed)
         if action is not None:
             expected = (*batch, allowed.dim)
             _refuse_other_shape(f"{self._at('safe_action')}: expected None or", action, expected)
@@ -334,11 +351,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _at(self, method: str) -> str:
         return f"constraint '{self.name}', {type(self).__name__}.{method}"
 
-    @contextmanager
-    def _naming_the_constraint(self, method: str) -> Iterator[None]:
-        """Add the names of constraint and method to errors of a constraint's own code."""
+    def _own(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a constraint's own code; its errors get the names of constraint and method."""
         try:
-            yield
+            return call(*arguments)
         except AttributeError as error:
             # An environment would report the AttributeError itself as a missing spec.
             raise GeometryError(f"{self._at(method)}: AttributeError: {error}") from error
@@ -407,8 +423,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _refuse_slack_of_wrong_shape(self, allowed: ConstraintSet, batch: torch.Size) -> None:
         zeros = next(iter(allowed.fields().values())).new_zeros(*batch, allowed.dim)
         method = f"constraint_set, {type(allowed).__name__}.slack"
-        with self._naming_the_constraint(method):
-            slack = allowed.slack(zeros)
+        slack = self._own(method, allowed.slack, zeros)
         given = f"for actions {tuple(zeros.shape)} expected"
         _refuse_other_shape(f"{self._at(method)}: {given}", slack, batch)
 
@@ -427,16 +442,20 @@ class GeometryTransform(Transform, ConstraintPublisher):
 class Check(NamedTuple):
     """What is to be checked of some states: the values that were read and the set they led to."""
 
-    inputs: list[Tensor]
+    inputs: dict[NestedKey, Tensor]
     allowed: ConstraintSet
     refuse: Callable[[], None]
     """Raises if a value is not as it must be."""
 
 
 def are_good(checks: Sequence[Check]) -> Tensor:
-    """Tell whether all values are as they must be, boolean ``()``, without reading it."""
+    """Tell whether all values are as they must be, boolean ``()``, without reading it.
+
+    Args:
+        checks: One or more checks of the same states.
+    """
     # What several constraints read is looked at once.
-    inputs = {id(value): value for check in checks for value in check.inputs}
+    inputs = {key: value for check in checks for key, value in check.inputs.items()}
     sizes = [
         value.abs().amax()
         for value in inputs.values()

@@ -4,6 +4,7 @@ from cnfp_torchrl.geometry.anchor import (
     DEPTH,
     LEEWAY,
     Anchored,
+    Begun,
     attempt_anchor,
     begin_anchor,
     chebyshev_center,
@@ -30,7 +31,7 @@ from cnfp_torchrl.geometry.constraint_set import (
 )
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.norms import length, power_of_two
-from cnfp_torchrl.geometry.projection import project, project_onto_intersection
+from cnfp_torchrl.geometry.projection import project, project_onto_intersection, settled
 from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
 from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
@@ -42,6 +43,7 @@ __all__ = [
     "LEEWAY",
     "Anchored",
     "Ball",
+    "Begun",
     "Bounds",
     "Box",
     "Cone",
@@ -75,5 +77,6 @@ __all__ = [
     "require_action_bounds",
     "row_depths",
     "scaled_direction",
+    "settled",
     "sides",
 ]

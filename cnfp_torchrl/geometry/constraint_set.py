@@ -227,6 +227,20 @@ class ConstraintSet(ABC):
         """
         return self.superlevel()
 
+    def parts_near(self, point: Tensor) -> Superlevel | None:
+        """Describe several convex parts, the one with the point closest to a point among them.
+
+        For the projection. Only non-convex families override this; None, the default, says that the
+        set is convex.
+
+        Args:
+            point: points ``(*batch, d)``.
+
+        Returns:
+            A description of batch shape ``(parts, *batch)``.
+        """
+        return None
+
     # What follows from it -------------------------------------------------------------------------
 
     def fields(self) -> dict[str, Tensor]:

@@ -41,6 +41,7 @@ class HalfSpaces(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
     finite_fields: ClassVar[frozenset[str]] = frozenset({"normals"})
+    _kept: ClassVar[Rows | None] = None  # an instance's own where it is known
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
@@ -59,8 +60,8 @@ class HalfSpaces(ConstraintSet):
         return frozenset({"offsets"})
 
     def contains(self, action: Tensor) -> Tensor:
-        sets = self.to(torch.float64)._normalized()
-        return (_rows(sets.normals, action.double()) <= sets.offsets).all(-1)
+        rows = self.to(torch.float64).superlevel()
+        return (_rows(rows.normals, action.double()) <= rows.offsets).all(-1)
 
     def slack(self, action: Tensor) -> Tensor:
         return self.row_slacks(action).amin(-1)
@@ -72,13 +73,11 @@ class HalfSpaces(ConstraintSet):
 
     def inflated(self, by: Tensor) -> Self:
         rows = self.superlevel()
-        return type(self)(rows.normals, rows.offsets + by * rows.rates, validate_args=False)
+        return self._with(rows, rows.offsets + by * rows.rates)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        rows, eps = self.superlevel(), EROSION_IN_EPS * torch.finfo(self.dtype).eps
-        largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
-        size = rows.normals.abs().sum(-1) * largest.unsqueeze(-1) + rows.offsets.abs()
-        return (eps * size / rows.rates).masked_fill(rows.offsets.isinf(), 0)
+        rows = self.superlevel()
+        return (self._erosion(rows, magnitude) / rows.rates).masked_fill(rows.offsets.isinf(), 0)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
@@ -97,12 +96,15 @@ class HalfSpaces(ConstraintSet):
         return Bounds(low, high)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        eps = EROSION_IN_EPS * torch.finfo(self.dtype).eps
+        rows = self.superlevel()
+        moved = rows.offsets - self._erosion(rows, magnitude)
+        return self._with(rows, torch.where(rows.offsets.isinf(), rows.offsets, moved))
+
+    def _erosion(self, rows: Rows, magnitude: Tensor | float) -> Tensor:
+        """Return by how much `eroded` lowers offsets, ``(*batch, m)``; infinite as they are."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
-        sets = self._normalized()
-        size = sets.normals.abs().sum(-1) * largest.unsqueeze(-1) + sets.offsets.abs()
-        offsets = torch.where(sets.offsets.isinf(), sets.offsets, sets.offsets - eps * size)
-        return type(self)(sets.normals, offsets, validate_args=False)
+        size = rows.normals.abs().sum(-1) * largest.unsqueeze(-1) + rows.offsets.abs()
+        return EROSION_IN_EPS * torch.finfo(self.dtype).eps * size
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
@@ -115,22 +117,36 @@ class HalfSpaces(ConstraintSet):
         )
 
     def superlevel(self) -> Rows:
-        sets = self._normalized()
-        lengths = vector_norm(sets.normals, dim=-1)
-        zero = lengths == 0
-        # A normal of zero lets every action pass or none.
-        offsets = torch.where(zero & (sets.offsets >= 0), torch.inf, sets.offsets)
-        return Rows(sets.normals, offsets, lengths.masked_fill(zero, 1))
-
-    def _normalized(self) -> Self:
-        """Return the same set with normals of about unit length, which do not vanish when squared.
-
-        An offset out of range beside its normal becomes infinite: no action reaches that row.
-        """
+        if self._kept is not None:
+            return self._kept
+        # Normals of about unit length, which do not vanish when squared. An offset out of range
+        # beside its normal becomes infinite: no action reaches that row.
         unit = power_of_two(self.normals.abs().amax(-1))
-        return type(self)(
-            self.normals / unit.unsqueeze(-1), self.offsets / unit, validate_args=False
-        )
+        normals = self.normals / unit.unsqueeze(-1)
+        lengths = vector_norm(normals, dim=-1)
+        zero = lengths == 0
+        rows = Rows(normals, self._passed(zero, self.offsets / unit), lengths.masked_fill(zero, 1))
+        # What was found without gradients must not be used with them.
+        if not (self.normals.requires_grad or self.offsets.requires_grad):
+            self._keep(rows)
+        return rows
+
+    @staticmethod
+    def _passed(zero: Tensor, offsets: Tensor) -> Tensor:
+        """Return offsets, infinite where a normal of zero lets every action pass, not none."""
+        return torch.where(zero & (offsets >= 0), torch.inf, offsets)
+
+    def _with(self, rows: Rows, offsets: Tensor) -> Self:
+        """Return the set with the normals of some rows and other offsets."""
+        offsets = self._passed((rows.normals == 0).all(-1), offsets)
+        moved = type(self)(rows.normals, offsets, validate_args=False)
+        moved._keep(Rows(rows.normals, offsets, rows.rates))
+        return moved
+
+    def _keep(self, rows: Rows) -> None:
+        # A compiler sees by itself what is computed twice.
+        if not torch.compiler.is_compiling():
+            object.__setattr__(self, "_kept", rows)
 
 
 def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:

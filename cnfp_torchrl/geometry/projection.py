@@ -15,7 +15,7 @@ from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
 from cnfp_torchrl.geometry.region import Region
-from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum
+from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows
 
 Projector: TypeAlias = Callable[[Tensor], Tensor]
 """From points ``(*batch, d)`` to the closest ones of a set."""
@@ -221,8 +221,8 @@ def projector(constraint_set: ConstraintSet) -> Projector:
     raise TypeError(
         "expected a set with a projection, one of "
         f"{[family.__name__ for family in PROJECTIONS]} or one whose `superlevel` is a Cone or a "
-        f"KinkedSum, given {type(constraint_set).__name__}; use the exact flow (flow=exact), which "
-        "takes every family"
+        f"KinkedSum, given {type(constraint_set).__name__}; a non-convex one is projected onto by "
+        "project_onto_intersection, and the exact flow (flow=exact) takes every family"
     )
 
 
@@ -250,17 +250,23 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
     where boundaries meet at a small angle. The result may lie outside by that error; a retraction
     towards the anchor moves it inside (`cnfp_torchrl.bijectors.Projection`).
 
+    Of non-convex sets the closest one of the points of their convex parts is taken
+    (`ConstraintSet.parts_near`).
+
     Source: Boyle and Dykstra 1986, "A method for finding projections onto the intersection of
     convex sets in Hilbert spaces".
 
     Args:
-        region: region of sets that have a `projector`; its anchor is not used.
+        region: region of sets that have a `projector` or convex parts; its anchor is used for the
+            latter alone.
         point: points ``(*batch, d)``.
         rounds: number of rounds of Dykstra's algorithm, >= 1.
 
     Raises:
         TypeError: for a set without projection.
     """
+    if any(part.parts_near(point) is not None for part in region.sets):
+        return _closest_of_parts(region, point, rounds)
     box, others = _split(region)
     if not others:
         return onto_box(box, point)
@@ -279,6 +285,43 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
             point = projected if active is None else torch.where(active, projected, moved)
             corrections[k] = moved - point
     return point
+
+
+def _closest_of_parts(region: Region, point: Tensor, rounds: int) -> Tensor:
+    """Return the closest of the projections onto the convex parts of non-convex sets.
+
+    All sets are eroded once more, so that what is found lies in the region, although a non-convex
+    region may hide it from its anchor.
+    """
+    magnitude = region.bounds.magnitude()
+    sets = [part.eroded(magnitude) for part in region.widened()]
+    parts = {k: rows for k, s in enumerate(sets) if (rows := s.parts_near(point)) is not None}
+    for axis, (stage, rows) in enumerate(parts.items(), 1):
+        assert isinstance(rows, Rows)
+        # An axis of parts for each set, so that all choices are combined.
+        ones = (1,) * (len(parts) - axis)
+        normals, offsets = (
+            field.unflatten(0, (-1, *ones)) for field in (rows.normals, rows.offsets)
+        )
+        if (counts := region.counts(stage)) is not None:
+            offsets = torch.where(counts.unsqueeze(-1), offsets, torch.inf)
+        sets[stage] = HalfSpaces(normals, offsets, validate_args=False)
+    unchanged = region.relaxation and tuple(torch.zeros_like(rho) for rho in region.relaxation)
+    convex = Region(sets, None, region.active, unchanged, validate_args=False)
+    shape = torch.broadcast_shapes(point.shape, convex.shape)
+    found = project_onto_intersection(convex, point.expand(shape), rounds)
+    found = settled(region, found.flatten(0, len(parts) - 1))
+    nearest = vector_norm(found - point, dim=-1).argmin(0)
+    return found.gather(0, nearest[None, ..., None].expand(1, *found.shape[1:])).squeeze(0)
+
+
+def settled(region: Region, point: Tensor) -> Tensor:
+    """Return points of a region: those that lie in it, and the others pulled towards its anchor.
+
+    Unlike `Region.pulled_in` it leaves points that a non-convex region hides from its anchor.
+    """
+    inside = region.contains(point).unsqueeze(-1)
+    return torch.where(inside, point, region.pulled_in(point))
 
 
 def _joins_box(part: ConstraintSet) -> bool:

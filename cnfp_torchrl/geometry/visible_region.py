@@ -182,6 +182,41 @@ class VisibleRegion(ConstraintSet):
         What a rectangle leaves is a union of half-spaces, the lines of `slack`: this side of it, or
         past a corner of it on the side away from its shadow. One is taken for each rectangle.
         """
+        normals, offsets, valid = self._half_spaces()
+        slack = offsets - (normals * point[..., None, None, :]).sum(-1)
+        best = torch.where(valid, slack, -torch.inf).argmax(-1)
+        return _chosen(normals, offsets, valid, best)
+
+    def parts_near(self, point: Tensor) -> Rows:
+        """Describe convex parts among which is that of the closest point to a point.
+
+        All choices of half-spaces for the two rectangles with the least slack, of those that leave
+        more than one, and for the others the half-space with the largest slack.
+        """
+        normals, offsets, valid = self._half_spaces()
+        slack = offsets - (normals * point[..., None, None, :]).sum(-1)
+        slack = torch.where(valid, slack, -torch.inf)
+        largest, best = slack.max(-1)
+        # No rectangle leaves more than these; the valid ones come first.
+        most = self.dim * (self.dim + 1)
+        order = torch.where(valid, -slack, torch.inf).argsort(-1)[..., :most]
+        valid = valid.expand(slack.shape)
+        order = torch.where(valid.gather(-1, order), order, best.unsqueeze(-1))
+        ranked = torch.where(valid.sum(-1) > 1, largest, torch.inf).argsort(-1)
+        parts = best.expand(most, most, *best.shape).clone()
+        for place in range(min(2, ranked.shape[-1])):
+            rectangle = ranked[..., [place]]
+            row = rectangle.unsqueeze(-1).expand(*rectangle.shape, order.shape[-1])
+            options = order.gather(-2, row).movedim(-1, 0)
+            options = options.unsqueeze(place).expand(*parts.shape[:-1], 1)
+            parts = parts.scatter(-1, rectangle.expand_as(options), options)
+        return _chosen(normals, offsets, valid, parts.flatten(0, 1))
+
+    def _half_spaces(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return all half-spaces that each rectangle leaves, and which of them exist.
+
+        Normals ``(*batch, m, n, d)`` and offsets ``(*batch, m, n)``.
+        """
         slope, rising, pair = self._lines()
         identity = torch.eye(self.dim, dtype=slope.dtype, device=slope.device)
         normals = torch.cat([identity, -identity])
@@ -191,18 +226,7 @@ class VisibleRegion(ConstraintSet):
         # All half-spaces, normal . a + t <= offset.
         normals = torch.cat([normals.expand(*slope.shape, -1), crossing.flatten(-3, -2)], -2)
         offsets = torch.cat([slope, torch.zeros_like(pair.flatten(-2), dtype=slope.dtype)], -1)
-        valid = torch.cat([rising, pair.flatten(-2)], -1)
-        slack = offsets - (normals * point[..., None, None, :]).sum(-1)
-        best = torch.where(valid, slack, -torch.inf).argmax(-1, keepdim=True)
-        # Not take_along_dim, with which an exported program would be one for a single batch size.
-        row = best.unsqueeze(-1).expand(*best.shape, self.dim)
-        normal = normals.expand(*best.shape[:-1], -1, -1).gather(-2, row).squeeze(-2)
-        offset = offsets.expand(*best.shape[:-1], -1).gather(-1, best).squeeze(-1)
-        # In a rectangle the part is empty: 0 a + t <= -1.
-        outside = valid.any(-1)
-        normal = torch.where(outside.unsqueeze(-1), normal, 0.0)
-        offset = torch.where(outside, offset, -1.0)
-        return Rows(normal, offset, torch.ones_like(offset))
+        return normals, offsets, torch.cat([rising, pair.flatten(-2)], -1)
 
     def _lines(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the slopes in tau of the lines of `slack`, which rise, and which pairs cross.
@@ -225,6 +249,20 @@ class VisibleRegion(ConstraintSet):
         seen = (corners - self.position[..., None, None, :]) / self.step[..., None, None, None]
         low, high = torch.where(finite, seen, self.rectangles).unbind(-2)
         return low, high
+
+
+def _chosen(normals: Tensor, offsets: Tensor, valid: Tensor, index: Tensor) -> Rows:
+    """Return one half-space for each rectangle, by its index ``(*parts, *batch, m)``."""
+    # Not take_along_dim, with which an exported program would be one for a single batch size.
+    index = index.unsqueeze(-1)
+    row = index.unsqueeze(-1).expand(*index.shape, normals.shape[-1])
+    normal = normals.expand(*index.shape[:-1], -1, -1).gather(-2, row).squeeze(-2)
+    offset = offsets.expand(*index.shape[:-1], -1).gather(-1, index).squeeze(-1)
+    # In a rectangle the part is empty: 0 a + t <= -1.
+    outside = valid.any(-1)
+    normal = torch.where(outside.unsqueeze(-1), normal, 0.0)
+    offset = torch.where(outside, offset, -1.0)
+    return Rows(normal, offset, torch.ones_like(offset))
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +354,14 @@ class VisibleOrBox(ConstraintSet):
 
     def part_near(self, point: Tensor) -> Rows:
         """Describe a convex part, see `VisibleRegion.part_near`, or the box."""
-        parts = (self.region.part_near(point), self.box.superlevel())
+        return self._or_box(self.region.part_near(point))
+
+    def parts_near(self, point: Tensor) -> Rows:
+        """Describe convex parts, see `VisibleRegion.parts_near`, or the box."""
+        return self._or_box(self.region.parts_near(point))
+
+    def _or_box(self, part: Rows) -> Rows:
+        parts = (part, self.box.superlevel())
         counts = (self.sees.unsqueeze(-1), ~self.sees.unsqueeze(-1))
         offsets = [
             torch.where(on, p.offsets, torch.inf) for p, on in zip(parts, counts, strict=True)

@@ -221,8 +221,9 @@ class ProjectionFlow(RegionFlow):
 
     As OptLayer (Pham et al., arXiv 1709.07643) and safety layers (Dalal et al. 2018, arXiv
     1801.08757) do. It is no bijection, so that no densities exist
-    (`cnfp_torchrl.bijectors.Projection`). For boxes, balls and half-spaces; onto a box with one
-    ball it is exact.
+    (`cnfp_torchrl.bijectors.Projection`). It takes all families that come with the library. Onto a
+    box with one ball, weighted L1 ball or positive part it is exact, also where a box, a ball or a
+    half-space stands alone.
 
     Args:
         rounds: The number of rounds of Dykstra's algorithm, for other intersections; actions that

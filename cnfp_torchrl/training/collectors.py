@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from cnfp_torchrl.modules import WarmUpPolicy
 from cnfp_torchrl.training.agent import build_environment
+from cnfp_torchrl.training.interruption import starting_workers
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -40,13 +41,21 @@ def make_collector(
     return make(partial(_worker_environment, plain), policy)
 
 
-def _worker_environment(config: Any, worker: int) -> TransformedEnv:
-    """Return a worker's environment, with random numbers of its own."""
+def _worker_environment(config: Any, worker: int, frames: int) -> TransformedEnv:
+    """Return a worker's environment, with random numbers of its own.
+
+    Args:
+        config: configuration of the run, as plain data.
+        worker: number of the worker.
+        frames: number of frames so far, after which a resumed run draws other numbers than at its
+            beginning.
+    """
     composed = OmegaConf.create(config)
+    seed = composed.seed + worker + frames
     torch.set_num_threads(composed.threads)
-    torch.manual_seed(composed.seed + 1 + worker)
+    torch.manual_seed(seed + 1)
     env = build_environment(composed, device=composed.device, with_penalty=True)
-    env.set_seed(composed.seed + worker)
+    env.set_seed(seed)
     return env
 
 
@@ -93,7 +102,7 @@ class WorkerCollector(ABC):
     episodes.
 
     Args:
-        make_env: what makes the environment of a worker, given its number.
+        make_env: what makes the environment of a worker, given its number and the frames so far.
         policy: the policy of training.
         workers: number of workers.
         frames_per_batch: number of frames that a worker collects at a time.
@@ -105,7 +114,7 @@ class WorkerCollector(ABC):
 
     def __init__(
         self,
-        make_env: Callable[[int], EnvBase],
+        make_env: Callable[[int, int], EnvBase],
         policy: TensorDictModuleBase,
         *,
         workers: int,
@@ -114,7 +123,7 @@ class WorkerCollector(ABC):
     ) -> None:
         if workers < 1:
             raise ValueError(f"collector.workers: expected a number >= 1, given {workers}")
-        self._make_envs: list[MakeEnv] = [partial(make_env, worker) for worker in range(workers)]
+        self._make_env, self._workers = make_env, workers
         self._policy = policy
         self._frames_per_batch, self._total_frames = frames_per_batch, total_frames
         self._frames = 0
@@ -130,7 +139,8 @@ class WorkerCollector(ABC):
         """Yield transitions ``(*environments, time)``."""
         warm_up = self._policy if isinstance(self._policy, WarmUpPolicy) else None
         acting = self._policy if warm_up is None else WorkerPolicy(warm_up)
-        self._running = self._start(self._make_envs, acting, self._total_frames - self._frames)
+        make_envs = [partial(self._make_env, i, self._frames) for i in range(self._workers)]
+        self._running = self._start(make_envs, acting, self._total_frames - self._frames)
         for batch in self._running:
             self._frames += batch.numel()
             if warm_up is not None:
@@ -164,14 +174,15 @@ class MultiSync(WorkerCollector):
     def _start(
         self, make_envs: Sequence[MakeEnv], policy: TensorDictModuleBase, frames: int
     ) -> MultiSyncCollector:
-        return MultiSyncCollector(
-            list(make_envs),
-            policy,
-            frames_per_batch=self._frames_per_batch * len(make_envs),
-            total_frames=frames,
-            cat_results="stack",
-            auto_register_policy_transforms=False,
-        )
+        with starting_workers():
+            return MultiSyncCollector(
+                list(make_envs),
+                policy,
+                frames_per_batch=self._frames_per_batch * len(make_envs),
+                total_frames=frames,
+                cat_results="stack",
+                auto_register_policy_transforms=False,
+            )
 
 
 class MultiAsync(WorkerCollector):
@@ -180,13 +191,14 @@ class MultiAsync(WorkerCollector):
     def _start(
         self, make_envs: Sequence[MakeEnv], policy: TensorDictModuleBase, frames: int
     ) -> MultiAsyncCollector:
-        return MultiAsyncCollector(
-            list(make_envs),
-            policy,
-            frames_per_batch=self._frames_per_batch,
-            total_frames=frames,
-            auto_register_policy_transforms=False,
-        )
+        with starting_workers():
+            return MultiAsyncCollector(
+                list(make_envs),
+                policy,
+                frames_per_batch=self._frames_per_batch,
+                total_frames=frames,
+                auto_register_policy_transforms=False,
+            )
 
 
 class Ray(WorkerCollector):
@@ -195,7 +207,7 @@ class Ray(WorkerCollector):
     Where none is running, one is started on this machine, and stopped at the end.
 
     Args:
-        make_env: what makes the environment of a worker, given its number.
+        make_env: see `WorkerCollector`.
         policy: the policy of training.
         memory: bytes that a worker asks Ray for.
         options: further arguments of `ray.init`, such as the address of a cluster.
@@ -207,7 +219,7 @@ class Ray(WorkerCollector):
 
     def __init__(
         self,
-        make_env: Callable[[int], EnvBase],
+        make_env: Callable[[int, int], EnvBase],
         policy: TensorDictModuleBase,
         *,
         memory: int,

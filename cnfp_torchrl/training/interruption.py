@@ -5,12 +5,31 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 """The signals that ask a run to stop; the second is Ctrl-C's."""
+
+
+@contextmanager
+def starting_workers() -> Iterator[None]:
+    """Let processes that are started here live through Ctrl-C, which ends the run after its step.
+
+    A terminal sends it to all its processes, and workers that ended by it would take the step with
+    them. They end with the run. SIGTERM they obey, for by it TorchRL ends those that are left when
+    one has died. A Ctrl-C that comes meanwhile reaches this process at the end.
+    """
+    # Otherwise started with the first worker, after which it lets the signal through.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class TrainingInterrupted(BaseException):

@@ -207,11 +207,5 @@ class Metrics:
         return mean
 
     def _log(self, name: str, value: float) -> None:
-        try:
-            for logger in self._loggers:
-                logger.log_scalar(name, value, step=self.frames)
-        except OSError as error:
-            raise OSError(
-                f"{name}: could not be logged at step {self.frames} ({error}); the states saved "
-                "before are whole. Make room, and go on with: cnfp-train resume=FOLDER"
-            ) from error
+        for logger in self._loggers:
+            logger.log_scalar(name, value, step=self.frames)

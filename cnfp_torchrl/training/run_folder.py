@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
 import pickle
 import shlex
 import weakref
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
-from cnfp_torchrl.training.checkpoints import save_data
+from cnfp_torchrl.training.checkpoints import CheckpointError, save_data
 from cnfp_torchrl.whole_file import whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
@@ -27,6 +28,8 @@ BEST = "best.pt"
 """The policy of the best score in training, in the form of the last one's `CHECKPOINT`."""
 STATES = "checkpoints"
 """The folder of the states that a run goes on from."""
+
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 class RunFolder:
@@ -292,12 +295,33 @@ class RunFolder:
             path = (self.path / name).with_stem(f"{Path(name).stem}-{number}")
         return path
 
+    @contextmanager
+    def naming_what_cannot_be_written(self) -> Iterator[None]:
+        """Name the folder where a full or read-only disk ends a run, whichever file it was.
+
+        Loggers write by threads and buffers of their own, whose errors name nothing.
+
+        Raises:
+            CheckpointError: in place of such an error, saying how to go on.
+        """
+        try:
+            yield
+        except CheckpointError:
+            raise
+        except OSError as error:
+            if error.errno not in _OF_THE_DISK:
+                raise
+            raise CheckpointError(
+                f"{self.path}: could not be written to ({error}); the states in it are whole. Make "
+                f"room, or the folder writable, and go on with: {self._resuming()}"
+            ) from error
+
+    def _resuming(self) -> str:
+        return f"cnfp-train resume={shlex.quote(str(self.path))}"
+
     def how_to_resume(self, frames: int) -> str:
         """Return a sentence for whoever stopped the run."""
-        return (
-            f"stopped and saved at step {frames}; go on with: "
-            f"cnfp-train resume={shlex.quote(str(self.path))}"
-        )
+        return f"stopped and saved at step {frames}; go on with: {self._resuming()}"
 
     def save_failure(self, error: BaseException) -> None:
         """Write why the run failed, as far as that can be written."""

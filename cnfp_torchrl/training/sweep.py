@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +28,23 @@ class SweepRun:
 
     Args:
         path: the run's folder.
-        overrides: what was asked for, by key.
-        state: done, failed, running or stopped.
+        given: what was asked for, as Hydra's overrides.
+        state: done, failed, running, stopped or not started.
         reason: why it failed, or where it stopped.
         summary: the run's summary; empty where it is not done.
     """
 
     path: Path
-    overrides: Mapping[str, str]
+    given: Sequence[str]
     state: str
     reason: str = ""
     summary: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def overrides(self) -> dict[str, str]:
+        """What was asked for, by key."""
+        parts = (override.partition("=") for override in self.given)
+        return {key.lstrip("+~"): value for key, _, value in parts}
 
     @property
     def is_done(self) -> bool:
@@ -92,8 +99,13 @@ class Mean:
         return cls(mean, float(stats.t.ppf(0.975, count - 1)) * error)
 
 
-def read_sweep(folder: Path) -> list[SweepRun]:
+def read_sweep(folder: Path, planned: Mapping[Path, Sequence[str]] | None = None) -> list[SweepRun]:
     """Return the runs in a folder, in the order of their numbers.
+
+    Args:
+        folder: the sweep's folder.
+        planned: the overrides of all runs that the sweep was to have, by the folders meant for
+            them; those that no folder holds are not started.
 
     Raises:
         FileNotFoundError: when there is none.
@@ -105,7 +117,12 @@ def read_sweep(folder: Path) -> list[SweepRun]:
             f"folder: expected that of a sweep, given {folder}, which holds no run; give the one "
             "under multirun/ that training printed when the sweep ended"
         )
-    return [_read_run(path) for path in sorted(found, key=_number)]
+    runs = [_read_run(path) for path in found]
+    begun = [sorted(run.given) for run in runs]
+    for path, given in (planned or {}).items():
+        if path not in found and sorted(given) not in begun:
+            runs.append(SweepRun(path, given, "not started"))
+    return sorted(runs, key=lambda run: _number(run.path))
 
 
 def varied(runs: Iterable[SweepRun]) -> list[str]:
@@ -131,16 +148,14 @@ def _number(path: Path) -> tuple[float, str]:
 
 def _read_run(path: Path) -> SweepRun:
     folder = RunFolder(path)
-    overrides = {}
+    given: list[str] = []
     if (path / OVERRIDES).is_file():
-        for each in yaml.safe_load((path / OVERRIDES).read_text(encoding="utf-8")) or []:
-            key, _, value = str(each).partition("=")
-            overrides[key.lstrip("+~")] = value
+        given = list(map(str, yaml.safe_load((path / OVERRIDES).read_text(encoding="utf-8")) or []))
     if folder.is_held:
-        return SweepRun(path, overrides, "running")
+        return SweepRun(path, given, "running")
     if folder.is_complete:
-        return SweepRun(path, overrides, "done", summary=folder.load_summary())
+        return SweepRun(path, given, "done", summary=folder.load_summary())
     if (reason := folder.load_failure()) is not None:
-        return SweepRun(path, overrides, "failed", reason)
+        return SweepRun(path, given, "failed", reason)
     steps = Checkpoints(path / STATES, keep=1).frames()
-    return SweepRun(path, overrides, "stopped", f"at step {steps[-1] if steps else 0}")
+    return SweepRun(path, given, "stopped", f"at step {steps[-1] if steps else 0}")

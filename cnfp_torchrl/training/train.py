@@ -39,7 +39,12 @@ from cnfp_torchrl.training.constraint_counts import (
 )
 from cnfp_torchrl.training.environment_state import CollectorState, EpisodesBeginAnewWarning
 from cnfp_torchrl.training.evaluation import Evaluation, LinearScore, evaluate_seeded
-from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interruption import (
+    STOP_SIGNALS,
+    StopRequest,
+    TrainingInterrupted,
+    starting_workers,
+)
 from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
@@ -69,10 +74,10 @@ def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dic
 
     Raises:
         ValueError: before any work, for a setting that makes no sense.
-        CheckpointError: when the state of the run cannot be written or read.
+        CheckpointError: when the state of the run cannot be written or read, or a log not written.
         TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved.
     """
-    with closing(folder):
+    with closing(folder), folder.naming_what_cannot_be_written():
         return _train(config, folder, resume)
 
 
@@ -89,15 +94,16 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     torch.set_num_threads(config.threads)
 
     # Environment, actor, algorithm and collector
-    env = build_environment(config, device=config.device, with_penalty=True)
-    env.set_seed(config.seed)
-    tally = ConstraintTally.of(env)
-    actor = build_actor(config, env)
     is_saved = saving.interval is not None
-    learner: Learner = instantiate(config.algorithm, _partial_=True)(
-        config, env, actor, folder.path / STATES if is_saved else None
-    )
-    collector = make_collector(config, env, learner.policy)
+    with starting_workers():  # such as those of a ParallelEnv
+        env = build_environment(config, device=config.device, with_penalty=True)
+        env.set_seed(config.seed)
+        tally = ConstraintTally.of(env)
+        actor = build_actor(config, env)
+        learner: Learner = instantiate(config.algorithm, _partial_=True)(
+            config, env, actor, folder.path / STATES if is_saved else None
+        )
+        collector = make_collector(config, env, learner.policy)
     learner.begin()
 
     # Callback and loggers
@@ -239,7 +245,10 @@ def _training_score(metrics: Metrics, score: LinearScore | None) -> tuple[float,
 
 def _evaluation_environment(config: DictConfig, episodes: int) -> TransformedEnv:
     """Return an environment for some episodes, without a penalty, on the device of training."""
-    return build_environment(config, batch_size=[episodes], device=config.device)
+    with starting_workers():
+        env = build_environment(config, batch_size=[episodes], device=config.device)
+        env.reset()  # which is when those of a ParallelEnv start
+        return env
 
 
 def _evaluations(

@@ -14,11 +14,11 @@ from cnfp_torchrl.bijectors import BoxSquash, NoDensityError, Projection
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import (
     ConstraintSet,
+    Ellipsoid,
     Region,
-    VisibleRegion,
     project_onto_intersection,
 )
-from tests.bijectors.cases import DTYPES, Case, Maker, latents
+from tests.bijectors.cases import DTYPES, Case, Maker, latents, regions
 
 Family = Callable[[Maker], ConstraintSet]
 
@@ -175,11 +175,29 @@ def test_rounds_are_checked(rounds: int) -> None:
         Projection(KINDS["box"].case().region(torch.float32), rounds=rounds)
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_actions_lie_in_a_visible_region_with_zero_tolerance(dtype: torch.dtype) -> None:
+    case = Case("", "projection", *regions()["visible-d2-batch"])
+    projection = Projection(case.region(dtype), rounds=20)
+    for length in (0.0, 1e-12, 1.0, 20.0, 1e6):
+        latent = latents(case, 100, dtype, length).requires_grad_()
+        action = projection(latent)
+        assert case.allows(action.detach()).all(), f"at |z| = {length}"
+        action.sum().backward()
+        assert latent.grad is not None
+        assert latent.grad.isfinite().all(), f"at |z| = {length}"
+
+
+class Undescribed(Ellipsoid):
+    """A family that says nothing about its shape."""
+
+    def superlevel(self) -> None:  # type: ignore[override]
+        return None
+
+
 def test_sets_of_no_described_shape_are_refused() -> None:
     make = Maker(2, slack=0.05)
-    wall = torch.tensor([[[0.5, -1.0], [0.6, 1.0]]], dtype=torch.float64)
-    step = torch.ones((), dtype=torch.float64)
-    seen = VisibleRegion(torch.zeros(2, dtype=torch.float64), wall, step)
-    region = Region((make.bounds(), seen), make.anchor)
-    with pytest.raises(TypeError, match=r"a set with a projection, .* given VisibleRegion"):
+    given = make.ellipsoid()
+    region = Region((make.bounds(), Undescribed(**given.fields())), make.anchor)
+    with pytest.raises(TypeError, match=r"a set with a projection, .* given Undescribed"):
         Projection(region, rounds=1)(torch.zeros(2, dtype=torch.float64))

@@ -2,13 +2,15 @@
 
 import csv
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.commands.sweep import main as sweep_command
+from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 
 TINY = [
     "collector.total_frames=96",
@@ -45,9 +47,9 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     arguments = ["-m", *TINY, *broken, f"hydra.sweep.dir='{sweep}'"]
     done = run("train", *arguments, cwd=tmp_path)
     assert done.returncode == 1
-    # As soon as it has failed, and not behind the others.
-    assert "0_lr-1e30: " in done.stderr.partition("Error executing job")[0]
     first, second = table(sweep)
+    # As soon as it has failed, and not behind the others.
+    assert f"{first['folder']}: " in done.stderr.partition("Error executing job")[0]
     assert first["state"].startswith("failed: ")
     assert "nan" in first["state"]
     assert second["state"] == "done"
@@ -63,20 +65,34 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert RunFolder(sweep / first["folder"]).load_failure() is not None
 
 
+@pytest.fixture(scope="module")
+def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a sweep over three seeds, one after another."""
+    folder = tmp_path_factory.mktemp("basic") / "sweep"
+    arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={folder}"]
+    done = run("train", *arguments, cwd=folder.parent)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def results(folder: Path) -> list[dict[str, str]]:
+    """The rows of a sweep's table, but for what a clock tells."""
+    rows = table(folder)
+    for row in rows:
+        del row["seconds"]
+    return rows
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["parallel", "submitit_local"])
 def test_launchers_give_the_runs_that_one_after_another_gives(
-    launcher: str, tmp_path: Path
+    launcher: str, basic: Path, tmp_path: Path
 ) -> None:
-    for name in ("basic", launcher):
-        folder = f"hydra.sweep.dir={tmp_path / name}"
-        done = run("train", "-m", *TINY, "seed=0,1", folder, f"hydra/launcher={name}", cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    tables = [table(tmp_path / name) for name in ("basic", launcher)]
-    for row in (*tables[0], *tables[1]):
-        del row["seconds"]
-    assert tables[0] == tables[1]
-    assert [row["state"] for row in tables[0]] == ["done", "done"]
+    arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={tmp_path / 's'}"]
+    done = run("train", *arguments, f"hydra/launcher={launcher}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert results(tmp_path / "s") == results(basic)
+    assert [row["state"] for row in table(basic)] == ["done"] * 3
 
 
 @pytest.mark.slow
@@ -95,30 +111,30 @@ def test_a_study_finds_no_run_that_broke_a_constraint(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_runs_that_were_not_finished_go_on_when_asked(tmp_path: Path) -> None:
-    settings = [*TINY, "seed=0,1", f"hydra.sweep.dir={tmp_path / 's'}"]
-    assert run("train", "-m", *settings, cwd=tmp_path).returncode == 0
-    before = table(tmp_path / "s")
-    (tmp_path / "s" / before[1]["folder"] / "summary.json").unlink()
-    run("sweep", "s", cwd=tmp_path)
-    assert [row["state"] for row in table(tmp_path / "s")] == ["done", "stopped: at step 96"]
-    done = run("sweep", "s", "--resume", "--jobs", "2", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    after = table(tmp_path / "s")
-    for row in (*before, *after):
-        del row["seconds"]
-    assert before == after
+def test_a_sweep_that_was_cut_short_goes_on_where_it_lies_now(
+    basic: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = results(basic)
+    sweep = tmp_path / "moved here"
+    shutil.copytree(basic, sweep)
+    (sweep / before[1]["folder"] / SUMMARY).unlink()
+    shutil.rmtree(sweep / before[2]["folder"])
+    sweep_command([str(sweep)])
+    states = [row["state"] for row in table(sweep)]
+    assert states == ["done", "stopped: at step 96", "not started"]
+    sweep_command([str(sweep), "--resume", "--jobs", "2"])
+    assert results(sweep) == before, capsys.readouterr()
 
 
 @pytest.mark.slow
 def test_a_job_that_slurm_starts_again_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    basic: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = [*TINY, f"hydra.run.dir={tmp_path / 'run'}"]
-    assert run("train", *arguments, cwd=tmp_path).returncode == 0
-    (tmp_path / "run" / "summary.json").unlink()
+    shutil.copytree(basic / table(basic)[0]["folder"], tmp_path / "run")
+    (tmp_path / "run" / SUMMARY).unlink()
+    arguments = [*TINY, "seed=0", f"hydra.run.dir={tmp_path / 'run'}"]
     assert "holds ['config.yaml'" in run("train", *arguments, cwd=tmp_path).stderr
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     again = run("train", *arguments, cwd=tmp_path)
-    assert again.returncode == 0
+    assert again.returncode == 0, again.stderr
     assert "goes on at step 96" in again.stderr

@@ -21,6 +21,7 @@ from cnfp_torchrl.geometry import (
     PositivePart,
     Region,
     TaskSpaceBall,
+    VisibleOrBox,
     VisibleRegion,
     WeightedL1Ball,
     project,
@@ -296,16 +297,78 @@ def test_more_rounds_come_closer() -> None:
     assert errors[-1] < 1e-6
 
 
-def test_families_that_are_not_convex_are_refused() -> None:
+def visible(count: int, rectangles: int) -> VisibleRegion:
+    """Return what random rectangles around 0 leave to be seen from there."""
+    center = 0.9 * torch.nn.functional.normalize(torch.randn(count, rectangles, 2).double(), dim=-1)
+    half = 0.1 + 0.3 * torch.rand(count, rectangles, 2).double()
+    corners = torch.stack([center - half, center + half], -2)
+    return VisibleRegion(torch.zeros(count, 2).double(), corners, torch.ones(count).double())
+
+
+@pytest.mark.parametrize("rectangles", [1, 2])
+@pytest.mark.parametrize("or_box", [False, True])
+def test_the_closest_visible_point_is_that_of_a_grid(rectangles: int, or_box: bool) -> None:
+    torch.manual_seed(rectangles)
+    seen = visible(20, rectangles)
+    allowed: ConstraintSet = seen
+    if or_box:
+        sees = torch.tensor([0.0, 1.0]).double().repeat(10)
+        box = cube(2, 0.3).with_fields(lambda field, _: field.expand(20, 2))
+        allowed = VisibleOrBox(**seen.fields(), **box.fields(), in_sight=sees)
+    ball = Ball(torch.zeros(20, 2).double(), torch.full((20,), 1.2).double())
+    region = Region((cube(2), ball, allowed), torch.zeros(20, 2).double())
+    given = 1.5 * torch.randn(10, 20, 2).double()
+    axis = torch.linspace(-1, 1, 161).double()
+    grid = torch.cartesian_prod(axis, axis).unsqueeze(1)
+    inside = region.contains(grid)
+    best = torch.stack(
+        [(grid - row).norm(dim=-1).masked_fill(~inside, torch.inf).amin(0) for row in given]
+    )
+    closest = project_onto_intersection(region, given, 300)
+    assert region.contains(closest).all()
+    distance = (closest - given).norm(dim=-1)
+    # Every point of the grid is further away, and the closest one by less than its diagonal.
+    assert (distance <= best + 1e-4).all()
+    assert (distance >= best - 0.018).all()
+
+
+def test_a_rectangle_is_passed_on_the_nearer_side() -> None:
+    corners = tensor(0.5, -0.2, 0.7, 0.6).reshape(1, 2, 2)
+    seen = VisibleRegion(tensor(0, 0), corners, tensor(1.0)[0])
+    region = Region((cube(2), seen), tensor(-0.5, 0))
+    given = torch.stack(
+        [tensor(0.55, -0.1), tensor(0.9, -0.3), tensor(0.6, 0.6), tensor(-0.2, 0.9)]
+    )
+    # Before it, beside it on either side of its shadow, and where it is not in the way.
+    below, above = (
+        torch.nn.functional.normalize(tensor(*corner), dim=-1)
+        for corner in [(0.5, -0.2), (0.5, 0.6)]
+    )
+    expected = torch.stack(
+        [tensor(0.5, -0.1), (given[1] @ below) * below, (given[2] @ above) * above, given[3]]
+    )
+    closest = project_onto_intersection(region, given, 1)
+    torch.testing.assert_close(closest, expected, rtol=0, atol=1e-9)
+
+
+def test_dropped_non_convex_sets_are_left_out() -> None:
+    seen = visible(5, 1)
+    given = torch.randn(50, 5, 2, dtype=torch.float64)
+    active = torch.tensor([True, False])
+    region = Region((cube(2), seen), torch.zeros(5, 2).double(), active)
+    closest = project_onto_intersection(region, given, 1)
+    torch.testing.assert_close(closest, given.clamp(-1, 1), rtol=0, atol=1e-12)
+
+
+def test_non_convex_families_alone_have_no_closed_form() -> None:
     walls = VisibleRegion.walls(tensor(-1, -1), tensor(1, 1))
     region = VisibleRegion(tensor(0, 0), walls, tensor(1.0)[0])
-    message = (
-        r"one of \['Box', 'Ball', 'HalfSpaces'\] or .* given VisibleRegion; use the exact flow"
-    )
-    with pytest.raises(TypeError, match=message):
+    with pytest.raises(TypeError, match=r"or .* given VisibleRegion; .*project_onto_intersection"):
         project(region, tensor(2, 2))
-    with pytest.raises(TypeError, match=message):
-        project_onto_intersection(Region((cube(2), region), tensor(0, 0)), tensor(2, 2), 1)
+    closest = project_onto_intersection(
+        Region((cube(2, 3.0), region), tensor(0, 0)), tensor(2, 2), 1
+    )
+    torch.testing.assert_close(closest, tensor(1, 1), rtol=0, atol=1e-12)
 
 
 def test_several_rows_have_no_closed_form_of_their_own() -> None:

@@ -1,13 +1,21 @@
 """Collectors in workers: weights arrive, the warm-up is counted for all, constraints hold."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import torch
 from omegaconf import DictConfig
+from scipy import stats
 from tensordict import TensorDict
+from torch import Tensor
 
 from cnfp_torchrl.modules import WarmUpPolicy
 from cnfp_torchrl.training.agent import build_actor, build_environment
@@ -18,7 +26,7 @@ from cnfp_torchrl.training.collectors import (
     make_collector,
     shutting_down,
 )
-from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.train import train
 
 MakeConfig = Callable[..., DictConfig]
@@ -68,20 +76,20 @@ def test_the_warm_up_is_counted_for_all_workers(make_config: MakeConfig) -> None
     env = build_environment(config)
     policy = WarmUpPolicy(build_actor(config, env), 40)
     options = {"workers": 2, "frames_per_batch": AGENTS, "total_frames": 96}
-    collector = InThisProcess(lambda worker: env, policy, **options)
+    collector = InThisProcess(lambda worker, frames: env, policy, **options)
     with shutting_down(collector):
         shapes = [batch.shape for batch in collector]
     assert shapes == [(2 * AGENTS, 1)] * 6
     # 16 frames a batch: the third one takes the last of the 40.
     assert collector.told == [True, True, False, False, False, False, None]
     assert policy.frames_left == 0
-    resumed = InThisProcess(lambda worker: env, policy, **options)
+    resumed = InThisProcess(lambda worker, frames: env, policy, **options)
     resumed.load_state_dict({"frames": 64})
     assert len(list(resumed)) == 2
     assert resumed.asked == 32
     assert resumed.state_dict() == {"frames": 96}
     with pytest.raises(ValueError, match=r"collector\.workers: expected a number >= 1, given 0"):
-        MultiSync(lambda worker: env, policy, **{**options, "workers": 0})
+        MultiSync(lambda worker, frames: env, policy, **{**options, "workers": 0})
 
 
 KINDS = ["multi_sync", "multi_async", "ray"]
@@ -143,3 +151,113 @@ def test_training(kind: str, make_config: MakeConfig, tmp_path: Path) -> None:
     summary = train(config, RunFolder.create(tmp_path / "run"))
     assert summary["steps"] == 320
     assert set(summary["violations"].values()) == {0}
+
+
+def ends_of_episodes(kind: str, make_config: MakeConfig, *, seed: int, shift: float = 0) -> Tensor:
+    """Return the returns and last actions of a fixed policy's episodes, ``(episodes, 3)``."""
+    config = make_config(
+        "env.agents=64",
+        "+env.base.max_steps=5",
+        f"collector={kind}",
+        "collector.total_frames=6400",
+        f"seed={seed}",
+    )
+    env = build_environment(config)
+    env.set_seed(seed)
+    torch.manual_seed(0)  # of the weights
+    actor = build_actor(config, env)
+    with torch.no_grad():
+        *_, bias = actor.parameters()
+        bias[0] += shift
+    torch.manual_seed(seed)
+    collector = make_collector(config, env, actor)
+    ends = []
+    with shutting_down(collector):
+        for batch in collector:
+            assert ("constraints", "anchor") in batch.keys(include_nested=True)
+            assert batch["next", "cost"].sum() == 0
+            ended = batch[batch["next", "done"].squeeze(-1)]
+            ends.append(torch.cat([ended["next", "episode_reward"], ended["action"]], -1))
+    return torch.cat(ends).double()
+
+
+def least_likely(first: Tensor, second: Tensor) -> float:
+    """Return the smallest p-value of two-sample Kolmogorov-Smirnov tests over the columns."""
+    columns = zip(first.unbind(-1), second.unbind(-1), strict=True)
+    return min(stats.ks_2samp(a.numpy(), b.numpy()).pvalue for a, b in columns)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_workers_collect_what_one_process_does(make_config: MakeConfig) -> None:
+    single = ends_of_episodes("single", make_config, seed=0)
+    assert len(single) == 6400 // 5
+    assert least_likely(single, ends_of_episodes("single", make_config, seed=1, shift=0.5)) < 1e-4
+    for kind, seed in (("multi_sync", 2), ("multi_async", 4)):
+        several = ends_of_episodes(kind, make_config, seed=seed)
+        assert len(several) >= 6400 // 5 - 64
+        assert len(several.unique(dim=0)) == len(several)
+        assert least_likely(single, several) > 1e-3, kind
+
+
+def begin(kind: str, path: Path) -> tuple[subprocess.Popen[str], list[psutil.Process]]:
+    """Begin a run that would take very long; return its process and workers once it is saved."""
+    settings = [
+        *TINY,
+        f"hydra.run.dir={path}",
+        f"collector={kind}",
+        "collector.total_frames=10000000",
+        "training.warmup_frames=0",
+        "training.update_ratio=0.05",
+        "evaluation.interval=null",
+        "checkpoint.interval=160",
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cnfp_torchrl.commands.train", *settings],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while not list((path / STATES).glob("state-*")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    return process, psutil.Process(process.pid).children(recursive=True)
+
+
+PATIENCE = 300
+"""Seconds after which a process counts as one that stays."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_ctrl_c_stops_a_run_and_its_workers(kind: str, tmp_path: Path) -> None:
+    if kind == "ray":
+        pytest.importorskip("ray", reason="of the extra 'ray'")
+    process, workers = begin(kind, tmp_path / "run")
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 128 + signal.SIGINT, told
+    assert "stopped and saved at step" in told
+    assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_no_worker_outlives_a_run_that_is_killed(kind: str, tmp_path: Path) -> None:
+    process, workers = begin(kind, tmp_path / "run")
+    process.kill()
+    process.communicate(timeout=PATIENCE)
+    assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_a_worker_that_is_killed_ends_the_run(kind: str, tmp_path: Path) -> None:
+    process, workers = begin(kind, tmp_path / "run")
+    killed = next(each for each in workers if "spawn_main" in " ".join(each.cmdline()))
+    killed.kill()
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert "worker" in told
+    assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]

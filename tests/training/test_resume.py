@@ -91,6 +91,8 @@ OTHERS = {
     "a learned price": ["loss=sac_lagrangian", "flow=unconstrained", "~env.score"],
     "a full buffer": ["replay_buffer.storage.max_size=72", "checkpoint.keep=1"],
     "computed sets": ["training.constraint_bytes=0", "flow=projection"],
+    "td3": ["algorithm=td3"],
+    "ppo": ["algorithm=ppo", "collector.frames_per_batch=32", "training.warmup_frames=0"],
 }
 
 

@@ -1,3 +1,4 @@
+import errno
 import io
 import json
 import os
@@ -17,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from cnfp_torchrl.training.agent import build_actor, build_environment, load_actor
+from cnfp_torchrl.training.checkpoints import CheckpointError
 from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, CONFIG, SUMMARY, RunFolder
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
@@ -256,3 +258,16 @@ def test_a_run_of_version_0_1_is_refused_as_such(trusted: tuple[str, ...], tmp_p
     with pytest.raises(ValueError, match=r"config\.yaml: .*version 0\.1.*train"):
         RunFolder(tmp_path).load_config(trusted)
     assert RunFolder(tmp_path).load_settings() == OLD
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_ends_a_run_is_told_with_the_folder(number: int, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "my run")
+    with (
+        pytest.raises(CheckpointError, match=r"my run: could not .*resume='.*my run'"),
+        folder.naming_what_cannot_be_written(),
+    ):
+        raise OSError(number, os.strerror(number))  # as loggers do, without a file's name
+    refused = OSError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
+    with pytest.raises(ConnectionRefusedError), folder.naming_what_cannot_be_written():
+        raise refused

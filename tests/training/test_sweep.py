@@ -8,7 +8,13 @@ from omegaconf import OmegaConf
 from scipy import stats
 
 from cnfp_torchrl.commands.sweep import MEANS, TABLE, mean_rows, report, run_rows
-from cnfp_torchrl.commands.sweep_folders import run_name, with_common_keys
+from cnfp_torchrl.commands.sweep_folders import (
+    MULTIRUN,
+    config_arguments,
+    planned_runs,
+    run_name,
+    with_common_keys,
+)
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.sweep import OVERRIDES, Mean, read_sweep, varied
 
@@ -102,6 +108,39 @@ def test_the_state_of_a_run_is_that_of_its_folder(sweep: Path) -> None:
     assert states["2_exact"] == ("stopped", "at step 100")
     running.close()
     assert read_sweep(sweep)[4].state == "stopped"
+
+
+def planned(tmp_path: Path, *overrides: str, sweeper: str = "x.BasicSweeper") -> dict[Path, Any]:
+    """What is known of a sweep's runs from what Hydra writes of it."""
+    sources = [{"path": "/conf", "provider": "main"}, {"path": "/mine", "provider": "command-line"}]
+    settings = {
+        "sweeper": {"_target_": sweeper, "params": {"optim.lr": "0.1,0.2"}},
+        "overrides": {"task": list(overrides)},
+        "job": {"config": {"override_dirname": {"exclude_keys": ["collector.total_frames"]}}},
+        "runtime": {"config_sources": sources},
+    }
+    OmegaConf.save({"hydra": settings}, tmp_path / MULTIRUN)
+    return planned_runs(tmp_path)
+
+
+def test_runs_that_never_began_are_told(tmp_path: Path) -> None:
+    given = ["collector.total_frames=100", "seed=range(2)", "+a.b='x y',null"]
+    plan = planned(tmp_path, *given)
+    assert len(plan) == 8
+    assert [path.name for path in plan][:2] == ["0_lr-0.1_seed-0_b-x-y", "1_lr-0.1_seed-0_b-null"]
+    first = ["optim.lr=0.1", "collector.total_frames=100", "seed=0", "+a.b='x y'"]
+    assert next(iter(plan.values())) == first
+    make_run(tmp_path, "0", "optim.lr=0.1", "seed=0", "+a.b='x y'", score=0.5)
+    states = [run.state for run in read_sweep(tmp_path, plan)]
+    assert states == ["done", *["not started"] * 7]
+    assert config_arguments(tmp_path) == ["--config-dir", "/mine"]
+
+
+def test_of_a_study_and_of_patterns_no_runs_are_planned(tmp_path: Path) -> None:
+    assert planned_runs(tmp_path) == {}
+    assert config_arguments(tmp_path) == []
+    assert planned(tmp_path, "seed=0,1", sweeper="x.OptunaSweeper") == {}
+    assert planned(tmp_path, "flow=glob(*)") == {}
 
 
 def test_a_report_leaves_tables_and_a_figure(sweep: Path) -> None:

@@ -35,14 +35,25 @@ FALL = 0.5
 """The share of its distance from the level by which an inequality may come nearer in one step."""
 
 
+_SMALL = 8
+"""The largest dimension for which elimination side by side is the fastest."""
+
+
 class _Cone(NamedTuple):
-    """A cone's slack, ``(size - |vector + matrix x|) / rate``, and the square of its matrix."""
+    """A cone's slack, ``size - |vector + matrix x|``, and the norm below which it has a tip."""
 
     matrix: Tensor
     vector: Tensor
     size: Tensor
-    rate: Tensor
-    square: Tensor
+    tip: Tensor
+
+
+class _Sum(NamedTuple):
+    """A sum's slack, ``size - upper . max(a, 0) + lower . max(-a, 0)``, a the action."""
+
+    upper: Tensor
+    lower: Tensor
+    size: Tensor
 
 
 class _Derivatives(NamedTuple):
@@ -52,13 +63,13 @@ class _Derivatives(NamedTuple):
         inverse: inverses of all M inequalities, the sides of the boxes first, ``(M, B)``.
         gradient: gradients of the slacks of those behind the boxes, ``(M - 2 d, d, B)``.
         pull: sum of all gradients times the inverses, ``(d, B)``.
-        curvature: terms of the Hessian for the curvature of the cones, ``(d, d, B)`` each.
+        lengths: norms that the slacks of the cones subtract, ``(B,)`` each.
     """
 
     inverse: Tensor
     gradient: Tensor
     pull: Tensor
-    curvature: list[Tensor]
+    lengths: list[Tensor]
 
 
 class Ascent:
@@ -74,36 +85,39 @@ class Ascent:
 
     def __init__(self, sets: Sequence[ConstraintSet], start: Tensor, upper: Tensor) -> None:
         self.shape, self.dim = start.shape[:-1], start.shape[-1]
+        self.count = self.shape.numel()
         bounds = bounds_of(sets)
         # In units of the bounds' half widths, about their middle.
-        middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
-        self.middle, self.half = self._last(middle), self._last(half)
+        low, high = self._last(bounds.low), self._last(bounds.high)
+        self.middle, self.half = (low + high) / 2, (high - low) / 2
         self.x = (self._last(start) - self.middle) / self.half
         self.upper = self._last(upper, 0)
-        self.least = torch.full_like(self.upper, -torch.inf)
+        self.tiny = torch.finfo(self.x.dtype).eps * self.half.amin(0)
         self.sees_all = all(type(s).part_near is ConstraintSet.part_near for s in sets)
-        boxes = [box for box in sets if isinstance(box, Box)]
-        high = [self._last(box.high - middle) for box in boxes]
-        low = [self._last(middle - box.low) for box in boxes]
-        self.sides = torch.cat([_least(high), _least(low)])
+        for box in sets[1:]:
+            if isinstance(box, Box):
+                low = torch.maximum(low, self._last(box.low))
+                high = torch.minimum(high, self._last(box.high))
+        sides = torch.broadcast_tensors(high - self.middle, self.middle - low)
+        self.sides = torch.stack(sides)
+        self.slopes = torch.stack([-self.half, self.half])
         self.normals: Tensor | None = None
         self.offsets: Tensor | None = None
         self.cones: list[_Cone] = []
-        self.sums: list[tuple[Tensor, Tensor, Tensor]] = []
+        self.sums: list[_Sum] = []
         rows = []
         for constraint_set in sets:
             part = None if isinstance(constraint_set, Box) else constraint_set.superlevel()
             if isinstance(part, Rows):
-                rows.append(self._rows(part, middle, half))
+                rows.append(self._rows(part))
             elif isinstance(part, Cone):
-                self.cones.append(self._cone(part, middle, half))
+                self.cones.append(self._cone(part))
             elif isinstance(part, KinkedSum):
                 self.sums.append(self._sum(part))
             elif not isinstance(constraint_set, Box):
                 self.sees_all = False
         if rows:
-            self.normals = torch.cat([normal for normal, _ in rows])
-            self.offsets = torch.cat([offset for _, offset in rows])
+            self.normals, self.offsets = (_stacked(parts) for parts in zip(*rows, strict=True))
 
     @property
     def point(self) -> Tensor:
@@ -118,10 +132,10 @@ class Ascent:
     def run(self, steps: int) -> None:
         """Take some steps, and improve the bounds with each of them."""
         for _ in range(steps):
-            self._step(self._evaluate())
+            self._step(self._evaluate()[0])
         self._evaluate()
 
-    def run_until(self, steps: int, share: float, depth: Tensor) -> Tensor:
+    def run_until(self, steps: int, share: float, depth: Tensor) -> tuple[Tensor, ...]:
         """Take steps until all points are deep enough or cannot be, and tell which are.
 
         Args:
@@ -130,22 +144,56 @@ class Ascent:
             depth: least slack that is enough, ``(*batch,)``.
 
         Returns:
-            Whether the points are deep enough, boolean ``(*batch,)``.
+            Points ``(B, d)``, upper bounds of the best slack, and whether the points are deep
+            enough, ``(B,)`` each, side by side.
         """
-        least = self._last(depth, 0)
+        least, left = self._last(depth, 0), None
+        anchor = upper = decided = self.x
         for step in range(steps + 1):
-            at = self._evaluate()
-            deep = (self.least >= least) & (self.least >= share * self.upper)
-            if step == steps or bool((deep | (self.upper < -least)).all()):
-                break
-            # Those that are deep enough stay.
-            self._step(at, deep)
-        return deep.view(self.shape)
+            at, slack = self._evaluate()
+            deep = slack >= torch.maximum(least, share * self.upper)
+            done = deep | (self.upper < -least)
+            count = self.count - int(done.sum()) if step < steps else 0
+            if 2 * count <= self.count:
+                here = self._flat_point()
+                if left is None:
+                    anchor, upper, decided = here, self.upper, deep
+                else:
+                    # Only now and then: writing apart costs more than what is written.
+                    anchor = anchor.index_copy(0, left, here)
+                    upper = upper.index_copy(0, left, self.upper)
+                    decided = decided.index_copy(0, left, deep)
+                if not count:
+                    break
+                keep = (~done).nonzero().squeeze(-1)
+                left = keep if left is None else left[keep]
+                least, done = _chosen(least, keep), done[keep]
+                at = self._select(keep, at)
+            self._step(at, done)
+        return anchor, upper, decided
 
-    def _evaluate(self) -> _Derivatives:
-        """Return the derivatives at the points, and improve the bounds by them."""
-        step = self.half * self.x
-        values, gradients, curved = [self.sides - torch.cat([step, -step])], [], []
+    def _flat_point(self) -> Tensor:
+        """Return the points side by side, ``(B, d)``."""
+        return torch.addcmul(self.middle, self.half, self.x).mT
+
+    def _select(self, keep: Tensor, at: _Derivatives) -> _Derivatives:
+        """Go on with some of the points, and return their derivatives."""
+        self.count = len(keep)
+        for name in ("middle", "half", "x", "upper", "tiny", "sides", "slopes"):
+            setattr(self, name, _chosen(getattr(self, name), keep))
+        if self.normals is not None and self.offsets is not None:
+            self.normals = _chosen(self.normals, keep)
+            self.offsets = _chosen(self.offsets, keep)
+        self.cones = [_Cone(*(_chosen(value, keep) for value in cone)) for cone in self.cones]
+        self.sums = [_Sum(*(_chosen(value, keep) for value in each)) for each in self.sums]
+        lengths = [_chosen(length, keep) for length in at.lengths]
+        inverse, gradient, pull = (_chosen(value, keep) for value in at[:3])
+        return _Derivatives(inverse, gradient, pull, lengths)
+
+    def _evaluate(self) -> tuple[_Derivatives, Tensor]:
+        """Return derivatives and the smallest slack at the points, and improve the bounds."""
+        value = torch.addcmul(self.sides, self.slopes, self.x).flatten(0, 1)
+        values, gradients, lengths = [value], [], []
         if self.normals is not None and self.offsets is not None:
             values.append(self.offsets + (self.normals * self.x).sum(1))
             gradients.append(self.normals)
@@ -153,53 +201,47 @@ class Ascent:
             white = cone.vector + (cone.matrix * self.x).sum(1)
             # Not `torch.linalg.vector_norm`, which is slow along the first dimension.
             length = white.square().sum(0).sqrt()
-            values.append(((cone.size - length) / cone.rate).unsqueeze(0))
+            values.append((cone.size - length).unsqueeze(0))
             # At the tip of the cone the gradient is 0, and the curvature would be infinite.
-            length = torch.maximum(length, 1e-3 * cone.size + torch.finfo(length.dtype).tiny)
-            unit = white / (length * cone.rate)
-            gradients.append(-(cone.matrix * unit.unsqueeze(1)).sum(0, keepdim=True))
-            curved.append(cone.rate / length)
+            lengths.append(torch.maximum(length, cone.tip))
+            unit = white / -lengths[-1]
+            gradients.append((cone.matrix * unit.unsqueeze(1)).sum(0, keepdim=True))
         for upper, lower, size in self.sums:
-            at = self.middle + step
+            at = torch.addcmul(self.middle, self.half, self.x)
             side = torch.where(at > 0, upper, lower)
             values.append((size - (side * at).sum(0)).unsqueeze(0))
             gradients.append((-side * self.half).unsqueeze(0))
-        value = torch.cat(values) if len(values) > 1 else values[0]
-        least = self.least = value.amin(0)
-        tiny = torch.finfo(least.dtype).eps * self.half.amin(0)
-        gap = torch.add(tiny, (self.upper - least).relu(), alpha=LEVEL)
-        inverse = (value - (least - gap)).reciprocal()
-        above, below, rest = inverse.split([self.dim, self.dim, len(inverse) - 2 * self.dim])
-        pull = self.half * (below - above)
-        gradient = (
-            torch.cat(gradients) if len(gradients) > 1 else (gradients or [value[:0, None]])[0]
-        )
+        if len(values) > 1:
+            value = torch.cat(values)
+        least = value.amin(0)
+        gap = torch.add(self.tiny, (self.upper - least).relu(), alpha=LEVEL)
+        level = least - gap
+        inverse = (value - level).reciprocal()
+        below = inverse[: 2 * self.dim].unflatten(0, (2, self.dim))
+        pull = (self.slopes * below).sum(0)
+        gradient = value[:0, None] if not gradients else _stacked(gradients)
         if gradients:
-            pull = pull + (rest.unsqueeze(1) * gradient).sum(0)
+            pull = pull + (inverse[2 * self.dim :].unsqueeze(1) * gradient).sum(0)
         # What the weighted mean of the slacks may become within the bounds.
-        mean = (inverse * value).sum(0) + (pull.abs() - pull * self.x).sum(0)
-        self.upper = torch.fmin(self.upper, mean / inverse.sum(0))
-        first = len(rest) - len(self.cones) - len(self.sums)
-        curvature = []
-        for place, (cone, bend) in enumerate(zip(self.cones, curved, strict=True), first):
-            along = gradient[place].unsqueeze(0) * gradient[place].unsqueeze(1)
-            curvature.append((rest[place] * bend) * (cone.square - along))
-        return _Derivatives(inverse, gradient, pull, curvature)
+        more = torch.addcmul(pull.abs(), pull, self.x, value=-1).sum(0) + len(value)
+        self.upper = torch.fmin(self.upper, level + more / inverse.sum(0))
+        return _Derivatives(inverse, gradient, pull, lengths), least
 
     def _step(self, at: _Derivatives, stays: Tensor | None = None) -> None:
         """Take a Newton step, shortened, from all points but those that stay."""
-        above, below, rest = at.inverse.split([self.dim, self.dim, len(at.inverse) - 2 * self.dim])
-        hessian = torch.diag_embed(
-            (self.half.square() * (above.square() + below.square())).mT, dim1=0, dim2=1
-        )
+        inverse, rest = at.inverse[: 2 * self.dim], at.inverse[2 * self.dim :]
+        diagonal = (self.slopes * inverse.unflatten(0, (2, self.dim))).square().sum(0)
+        hessian = torch.diag_embed(diagonal.mT, dim1=0, dim2=1)
         if len(rest):
             scaled = rest.unsqueeze(1) * at.gradient
             hessian = hessian + (scaled.unsqueeze(1) * scaled.unsqueeze(2)).sum(0)
-        for curvature in at.curvature:
-            hessian = hessian + curvature
+        first = len(rest) - len(self.cones) - len(self.sums)
+        for place, (cone, length) in enumerate(zip(self.cones, at.lengths, strict=True), first):
+            square = (cone.matrix.unsqueeze(1) * cone.matrix.unsqueeze(2)).sum(0)
+            along = at.gradient[place].unsqueeze(0) * at.gradient[place].unsqueeze(1)
+            hessian = hessian + rest[place] / length * (square - along)
         move = _solve(hessian, at.pull)
-        step = self.half * move
-        changes = [-step, step]
+        changes = [(self.slopes * move).flatten(0, 1)]
         if len(rest):
             changes.append((at.gradient * move).sum(1))
         fall = (torch.cat(changes) * at.inverse).amin(0)
@@ -209,56 +251,63 @@ class Ascent:
             move = move.nan_to_num()
         self.x = torch.addcmul(self.x, share, move)
 
-    def _rows(self, part: Rows, middle: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    def _rows(self, part: Rows) -> tuple[Tensor, Tensor]:
         """Return gradients ``(m, d, B)`` and the slacks in the middle ``(m, B)``."""
-        rates = part.rates.masked_fill(part.rates == 0, 1)
-        normals = part.normals / rates.unsqueeze(-1)
-        offsets = part.offsets / rates - (normals * middle.unsqueeze(-2)).sum(-1)
+        normals, offsets = self._last(part.normals, 2), self._last(part.offsets)
+        rates = self._last(part.rates)
+        rates = rates.masked_fill(rates == 0, 1)
+        normals, places = normals / rates.unsqueeze(1), offsets / rates
+        places = places - (normals * self.middle).sum(1)
         # Rows that let every action pass are far away, not infinitely far: 0 times infinity is NaN.
-        far = 1e3 * half.sum(-1, keepdim=True)
-        offsets = torch.where(part.offsets.isinf(), far, offsets)
-        normals = normals.masked_fill(part.offsets.isinf().unsqueeze(-1), 0)
-        return self._last(-normals * half.unsqueeze(-2), 2), self._last(offsets)
+        free = offsets.isinf()
+        places = torch.where(free, 1e3 * self.half.sum(0), places)
+        return (normals * -self.half).masked_fill(free.unsqueeze(1), 0), places
 
-    def _cone(self, part: Cone, middle: Tensor, half: Tensor) -> _Cone:
-        matrix = part.matrix * half.unsqueeze(-2)
-        vector = part.vector + (part.matrix * middle.unsqueeze(-2)).sum(-1)
-        matrix, rate = self._last(matrix, 2), self._last(part.rate, 0)
-        relative = matrix / rate
-        # (B, d, d) would be multiplied one by one.
-        square = (relative.unsqueeze(1) * relative.unsqueeze(2)).sum(0)
-        return _Cone(matrix, self._last(vector), self._last(part.size, 0), rate, square)
+    def _cone(self, part: Cone) -> _Cone:
+        rate = self._last(part.rate, 0)
+        matrix, size = self._last(part.matrix, 2) / rate, self._last(part.size, 0) / rate
+        vector = self._last(part.vector) / rate + (matrix * self.middle).sum(1)
+        tip = 1e-3 * size + torch.finfo(size.dtype).tiny
+        return _Cone(matrix * self.half, vector, size, tip)
 
-    def _sum(self, part: KinkedSum) -> tuple[Tensor, Tensor, Tensor]:
-        free = part.rate == 0
-        rate = part.rate.masked_fill(free, 1)
-        size = (part.size / rate).masked_fill(free, torch.finfo(rate.dtype).max ** 0.25)
-        slopes = (slope / rate.unsqueeze(-1) for slope in (part.upper, part.lower))
-        upper, lower = (self._last(slope) for slope in slopes)
-        return upper, lower, self._last(size, 0)
+    def _sum(self, part: KinkedSum) -> _Sum:
+        rate = self._last(part.rate, 0)
+        free = rate == 0
+        rate = rate.masked_fill(free, 1)
+        size = self._last(part.size, 0) / rate
+        size = size.masked_fill(free, torch.finfo(rate.dtype).max ** 0.25)
+        return _Sum(self._last(part.upper) / rate, self._last(part.lower) / rate, size)
 
     def _last(self, value: Tensor, events: int = 1) -> Tensor:
-        """Return values ``(*batch, *event)`` as ``(*event, B)``."""
+        """Return values ``(*batch, *event)`` as ``(*event, B)``, or with 1 where all are alike."""
         event = value.shape[value.ndim - events :]
-        flat = value.expand((*self.shape, *event)).reshape(-1, *event)
-        return flat.movedim(0, -1).contiguous()
+        batch = value.shape[: value.ndim - events]
+        if batch.numel() > 1 and batch != self.shape:
+            value = value.expand((*self.shape, *event))
+        return value.reshape(-1, *event).movedim(0, -1).contiguous()
 
 
-def _least(values: Sequence[Tensor]) -> Tensor:
-    return values[0] if len(values) == 1 else torch.stack(list(values)).amin(0)
+def _chosen(value: Tensor, keep: Tensor) -> Tensor:
+    """Return some values of a batch, or the one for all."""
+    return value if value.shape[-1] == 1 else value.index_select(-1, keep)
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Return parts ``(m, ..., B)`` behind each other, where some may be the same for all."""
+    if len(parts) == 1:
+        return parts[0]
+    batch = max(part.shape[-1] for part in parts)
+    return torch.cat([part.expand(*part.shape[:-1], batch) for part in parts])
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve with positive definite matrices ``(d, d, B)``, by elimination where they are small."""
-    if len(right) > 4 and not torch.compiler.is_exporting():
+    if len(right) > _SMALL and not torch.compiler.is_exporting():
         solution = torch.linalg.solve_ex(matrix.permute(2, 0, 1), right.mT.unsqueeze(-1))[0]
         return solution.squeeze(-1).mT
     rest = torch.cat([matrix, right.unsqueeze(1)], 1)
-    rows = []
-    for _ in range(len(right)):
-        rows.append(rest[0, 1:] / rest[0, 0])
-        rest = rest[1:, 1:] - rest[1:, :1] * rows[-1]
-    known = rows.pop()
-    for row in reversed(rows):
-        known = torch.cat([row[-1:] - (row[:-1] * known).sum(0, keepdim=True), known])
-    return known
+    for k in range(len(right)):
+        row = rest[k, 1:] / rest[k, 0]
+        rest = torch.addcmul(rest[:, 1:], rest[:, :1], row, value=-1)
+        rest[k] = row
+    return rest[:, 0]

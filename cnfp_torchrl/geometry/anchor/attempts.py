@@ -15,8 +15,8 @@ from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 STEPS = 6
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
 
-REFINEMENTS = (4, 3)
-"""The numbers of steps inwards after which it is looked which states need more of them."""
+REFINEMENT = 5
+"""The largest number of steps inwards where it is looked which states need more of them."""
 
 SHARE = 0.3
 """The share of the best slack that is enough for an attempt."""
@@ -126,35 +126,13 @@ def refined_attempt(
     Returns:
         The attempts in all states, side by side.
     """
-    anchor, upper, decided = before
-    left: Tensor | None = None
-    shape = before.decided.shape
-    for steps in REFINEMENTS:
-        ascent = Ascent(sets, before.anchor, before.upper)
-        if ascent.sees_all:
-            largest = depths[0].amax(-1)
-            for depth in depths[1:]:
-                largest = torch.maximum(largest, depth.amax(-1))
-            deep = ascent.run_until(steps, SHARE, largest)
-            found = Attempt(ascent.point, ascent.bound, deep)
-            impossible = (found.upper < -largest).flatten()
-        else:
-            found = further_attempt(sets, depths, before, steps)
-            impossible = torch.zeros_like(found.decided).flatten()
-        found = found.select()
-        if left is None:
-            anchor, upper, decided = found
-        else:
-            anchor[left], upper[left], decided[left] = found
-        if bool(found.decided.all()):
-            break
-        hard = (~found.decided & ~impossible).nonzero().squeeze(-1)
-        if not len(hard):
-            break
-        sets, depths = select_states(sets, depths, shape, hard)
-        left, before = hard if left is None else left[hard], found.select(hard)
-        shape = before.decided.shape
-    return Attempt(anchor, upper, decided)
+    ascent = Ascent(sets, before.anchor, before.upper)
+    if not ascent.sees_all:
+        return further_attempt(sets, depths, before, STEPS).select()
+    largest = depths[0].amax(-1)
+    for depth in depths[1:]:
+        largest = torch.maximum(largest, depth.amax(-1))
+    return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
 
 
 def select_states(

@@ -13,7 +13,7 @@ bounded over the action bounds: no bound rests on convergence.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -23,6 +23,9 @@ from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program, l
 MAX_ITERATIONS = 60
 """The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
 
+_LARGEST = 3.0
+"""The largest weight at the start of what is not on trial, where what is has one of 1 at most."""
+
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
 
@@ -31,11 +34,20 @@ _SMALL = 8
 
 
 class Best(NamedTuple):
-    """The best found actions ``(B, d)``, their slacks, and upper bounds of the slack ``(B,)``."""
+    """The best found actions, and what certifies that there are none much better.
+
+    Attributes:
+        action: actions, ``(B, d)``.
+        slack: their slacks, ``(B,)``.
+        upper_bound: upper bounds of the slack, ``(B,)``.
+        weights: weights of sums, rows and cones in these bounds, in sum 1 for those on trial, NaN
+            where no weights were needed, ``(R, B)``; None where they are not known.
+    """
 
     action: Array
     slack: Array
     upper_bound: Array
+    weights: Array | None = None
 
 
 Settled: TypeAlias = Callable[[Array, Array, Index], Flags]
@@ -62,6 +74,8 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
         left = np.arange(len(start))
         path = _Path.begin(problem, x)
         lower, upper, best = x[problem.dim] + 1, problem.bound(), x
+        proof = np.zeros_like(path.rates)
+        weights = np.empty_like(proof)
         for iteration in range(MAX_ITERATIONS + 1):
             scale = problem.unit[left]
             undecided = ~settled(lower * scale, upper * scale, left)
@@ -69,19 +83,23 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
             if count <= len(left) // 2:
                 # Until then those that are settled go on with the others, but count no more.
                 found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
+                weights[:, left] = proof / (proof * path.rates).sum(0)
                 if not count:
                     break
                 path, left, best = path.select(undecided), left[undecided], best[:, undecided]
-                lower, upper = lower[undecided], upper[undecided]
+                lower, upper, proof = lower[undecided], upper[undecided], proof[:, undecided]
                 undecided = undecided[undecided]
             slack, height = path.slacks()
-            least, above, product = path.bounds(slack, height)
+            rooms, above, product = path.bounds(slack, height)
+            least = (rooms + path.spare).min(0)
             better = undecided & (least > lower)
             best = np.where(better, path.x, best)
             lower = np.where(better, least, lower)
-            upper = np.where(undecided & (above < upper), above, upper)
+            nearer = undecided & (above < upper)
+            upper = np.where(nearer, above, upper)
+            proof = np.where(nearer, path.proof(), proof)
             path.advance(slack, height, product)
-        return Best(problem.action(found), largest, bound)
+        return Best(problem.action(found), largest, bound, weights[2 * len(problem.reach) :])
 
 
 @dataclass(eq=False)
@@ -93,6 +111,7 @@ class _Path:
         offsets: their offsets, ``(M, B)``.
         cones: cones of the program, ``(J, 1 + k, n, B)``.
         tips: their constants, ``(J, 1 + k, B)``.
+        rates: 1 for rows and cones on trial and 0 for the others, ``(M + J, B)``.
         spare: 0 for what is on trial and infinite for the others, ``(M + J, B)``.
         low: least values of all unknowns but t, ``(n, B)``.
         high: largest values of all unknowns but t, ``(n, B)``.
@@ -106,6 +125,7 @@ class _Path:
     offsets: Array
     cones: Array
     tips: Array
+    rates: Array
     spare: Array
     low: Array
     high: Array
@@ -116,7 +136,7 @@ class _Path:
 
     @classmethod
     def begin(cls, problem: Program, x: Array) -> Self:
-        """Return the paths from points on, with weights for which the points are best in t."""
+        """Return the paths from points on, with weights for which these are about the best."""
         dim = problem.dim
         rates = np.concatenate([problem.rows[:, dim], problem.cones[:, 0, dim]])
         low, high = np.zeros_like(x), np.ones_like(x)
@@ -126,6 +146,7 @@ class _Path:
             offsets=problem.offsets,
             cones=problem.cones,
             tips=problem.tips,
+            rates=rates,
             spare=np.where(rates > 0, 0.0, np.inf),
             low=low,
             high=high,
@@ -137,13 +158,18 @@ class _Path:
         slack, height = path.slacks()
         weights, duals = 1 / slack, _flipped(height) / _det(height)[:, None]
         pull = (np.concatenate([weights, duals[:, 0]]) * rates).sum(0)
-        path.weights, path.duals = weights / pull, duals / pull
+        # What is not on trial may be nearly touched, yet matter little in the end.
+        most = np.where(rates > 0, np.inf, _LARGEST)
+        most[: 2 * len(problem.reach)] = np.inf  # the terms of sums belong to these
+        weights = np.minimum(weights, most[: len(weights)])
+        excess = np.maximum(duals[:, 0] / most[len(weights) :], 1)
+        path.weights, path.duals = weights / pull, duals / (excess[:, None] * pull)
         return path
 
     def select(self, keep: Flags) -> Self:
         """Return some of the B paths."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values.items()})
+        values = vars(self).items()
+        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values})
 
     def slacks(self) -> tuple[Array, Array]:
         """Return the slacks of rows ``(M, B)`` and of cones ``(J, 1 + k, B)``."""
@@ -151,7 +177,12 @@ class _Path:
         return slack, self.tips - times(self.cones, self.x) if len(self.cones) else self.tips
 
     def bounds(self, slack: Array, height: Array) -> tuple[Array, Array, Array]:
-        """Return bounds of the best t, and the weighted sums of all slacks, ``(B,)`` each."""
+        """Bound the best t.
+
+        Returns:
+            By how much rows and cones hold without t, ``(M + J, B)``, upper bounds of the best t,
+            and the weighted sums of all slacks, ``(B,)`` each.
+        """
         rooms, pull = slack, _pulled(self.rows, self.weights)
         product = (slack * self.weights).sum(0)
         if len(self.cones):
@@ -162,62 +193,72 @@ class _Path:
         rest = np.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
         rest[self.dim] = product
         t = self.x[self.dim]
-        return t + (rooms + self.spare).min(0), t + rest.sum(0) / pull[self.dim], product
+        return rooms + self.rates * t, t + rest.sum(0) / pull[self.dim], product
+
+    def proof(self) -> Array:
+        """Return the weights of rows and cones in the upper bounds, ``(M + J, B)``."""
+        return np.concatenate([self.weights, self.duals[:, 0]])
 
     def advance(self, slack: Array, height: Array, product: Array) -> None:
-        """Take a step, from slacks and their weighted sums."""
-        count = len(slack)
-        root = np.sqrt(self.weights / slack)
-        scaled, point = self.rows * root[:, None], slack * root
-        scaling = ConeScaling.between(height, self.duals) if len(self.cones) else None
-        if scaling is not None:
-            cones = [scaling.unscaled(self.cones), scaling.scaled(self.duals)]
-            scaled = np.concatenate([scaled, _side_by_side(cones[0])])
-            point = np.concatenate([point, _side_by_side(cones[1])])
-        matrix = _Normal.of(scaled)
-        goal = np.zeros_like(self.x)
-        goal[self.dim] = 1
-        fall = times(scaled, matrix.solve(goal))
-        share = 1 / np.maximum(self._limits(point, np.stack([fall, point - fall])).max(0), 1)
-        # The less a step without centering would gain, the more centering there is.
-        center = (1 - share) ** 3 * (product / (count + len(self.cones)))
-        aim = (center + (fall * (fall - point))[:count]) / point[:count]
-        if scaling is not None:
-            own, falls = (v[count:].reshape(height.shape) for v in (point, fall))
-            wanted = _product(falls, falls - own)
-            wanted[:, 0] += center
-            aim = np.concatenate([aim, _side_by_side(_quotient(wanted, own))])
-        move = matrix.solve(goal - _pulled(scaled, aim))
-        fall = times(scaled, move)
-        loss = point - aim - fall
-        limits = self._limits(point, np.stack([fall, loss]))
-        if scaling is not None:
-            limits[:] = limits.max(0)
-        ahead, along = _FRACTION / np.maximum(limits, _FRACTION)
-        self.x = self.x + ahead * move
-        self.weights = self.weights - along * (root * loss[:count])
-        if scaling is not None:
-            change = scaling.unscaled(loss[count:].reshape(height.shape))
-            self.duals = self.duals - along * change
+        """Take a step, from slacks and their weighted sums.
 
-    def _limits(self, point: Array, changes: Array) -> Array:
-        """Return the inverse of the largest steps of slacks and weights, ``(2, B)``.
-
-        Args:
-            point: slacks, which are as large as the weights, in the scaling of the step.
-            changes: what a step takes off the slacks and off the weights.
+        For rows all is relative to their slacks and weights, for cones in a scaling in which the
+        two are the same vector.
         """
-        count = len(self.rows)
-        limits = (changes[:, :count] / point[:count]).max(1)
-        if len(self.cones):
-            own = point[count:].reshape(self.duals.shape)
-            falls = changes[:, count:].reshape(2, *self.duals.shape)
-            # A cone is left where own - step * falls has a determinant of 0, a quadratic.
-            det, along = _det(own), (_flipped(own) * falls).sum(2)
-            squared = np.square(falls[:, :, 0]) - np.square(falls[:, :, 1:]).sum(2)
-            steepest = (along + np.sqrt(np.maximum(along * along - squared * det, 0))) / det
-            limits = np.maximum(limits, steepest.max(1))
-        return limits
+        count, cones = len(slack), len(self.cones)
+        measure = self.weights / slack
+        left, right = self.rows * measure[:, None], self.rows
+        if cones:
+            scaling = ConeScaling.between(height, self.duals)
+            scaled = _side_by_side(scaling.unscaled(self.cones))
+            point = scaling.scaled(self.duals)
+            left, right = np.concatenate([left, scaled]), np.concatenate([right, scaled])
+        inverse = _inverted(left, right)
+        # First a step without centering: the less it would gain, the more centering there is.
+        move = inverse[:, self.dim]
+        fall = times(self.rows, move) / slack
+        limit = np.maximum(fall.max(0), 1 - fall.min(0))
+        if cones:
+            falls = times(scaled, move).reshape(point.shape)
+            limit = np.maximum(limit, _limits(point, np.stack([falls, point - falls])).max(0))
+        far = 1 - 1 / np.maximum(limit, 1)
+        center = far * far * far * product / (count + cones)
+        aim = center / (slack * self.weights) + fall * (fall - 1)
+        pull = -_pulled(self.rows, self.weights * aim)
+        if cones:
+            wanted = _product(falls, falls - point)
+            wanted[:, 0] += center
+            aims = _quotient(wanted, point)
+            pull -= _pulled(scaled, _side_by_side(aims))
+        pull[self.dim] += 1
+        move = times(inverse, pull)
+        fall = times(self.rows, move) / slack
+        loss = 1 - aim - fall
+        ahead, along = fall.max(0), loss.max(0)
+        if cones:
+            falls = times(scaled, move).reshape(point.shape)
+            losses = point - aims - falls
+            limits = _limits(point, np.stack([falls, losses]))
+            ahead = along = np.maximum(limits.max(0), np.maximum(ahead, along))
+        ahead, along = (_FRACTION / np.maximum(limit, _FRACTION) for limit in (ahead, along))
+        self.x = self.x + ahead * move
+        self.weights = self.weights * (1 - along * loss)
+        if cones:
+            self.duals = self.duals - along * scaling.unscaled(losses)
+
+
+def _limits(point: Array, changes: Array) -> Array:
+    """Return the inverse of the largest steps of slacks and weights of cones, ``(2, B)``.
+
+    Args:
+        point: slacks, which are as large as the weights, in the scaling of the step.
+        changes: what a step takes off the slacks and off the weights, ``(2, J, 1 + k, B)``.
+    """
+    # A cone is left where point - step * changes has a determinant of 0, a quadratic.
+    det, along = _det(point), (_flipped(point) * changes).sum(2)
+    squared = np.square(changes[:, :, 0]) - np.square(changes[:, :, 1:]).sum(2)
+    steepest = (along + np.sqrt(np.maximum(along * along - squared * det, 0))) / det
+    return np.asarray(steepest.max(1), dtype=np.float64)
 
 
 class ConeScaling(NamedTuple):
@@ -261,47 +302,33 @@ class ConeScaling(NamedTuple):
         return result / size[:, None]
 
 
-class _Normal(NamedTuple):
-    """Matrices ``S^T S``, inverted where they are small: what that costs in accuracy is one step's.
+def _inverted(left: Array, right: Array) -> Array:
+    """Return the inverses ``(n, n, B)`` of products ``left^T right`` of matrices ``(m, n, B)``.
 
-    Args:
-        matrix: matrices ``(B, n, n)``, or their inverses ``(n, n, B)``.
-        inverted: whether they are inverses.
+    The products are symmetric and positive definite. What an inverse costs in accuracy is one
+    step's.
     """
-
-    matrix: Array
-    inverted: bool
-
-    @classmethod
-    def of(cls, scaled: Array) -> Self:
-        """Return the matrices for S, ``(m, n, B)``."""
-        each = np.arange(scaled.shape[1])
-        if len(each) > _SMALL:
-            first = np.ascontiguousarray(scaled.transpose(2, 0, 1))
-            matrix = first.transpose(0, 2, 1) @ first
-            # Rounding may have made a matrix singular.
-            matrix[:, each, each] *= 1 + 1e-14
-            # Of problems that went on after they were settled, which no longer count.
-            matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
-            return cls(matrix, inverted=False)
-        inverse = np.einsum("mib,mjb->ijb", scaled, scaled)
-        least = 1e-15 * inverse[each, each]
-        for k in each:
-            # Where rounding made a matrix indefinite, t still grows along the direction.
-            pivot = np.maximum(inverse[k, k], least[k])
-            column, row = inverse[:, k] / pivot, inverse[k].copy()
-            inverse -= column[:, None] * row
-            inverse[k] = row / pivot
-            inverse[:, k] = -column
-            inverse[k, k] = 1 / pivot
-        return cls(inverse, inverted=True)
-
-    def solve(self, right: Array) -> Array:
-        """Return the solutions for right-hand sides ``(n, B)``."""
-        if self.inverted:
-            return times(self.matrix, right)
-        solution = np.linalg.solve(self.matrix, right.T[..., None])
-        return np.asarray(solution[..., 0].T, dtype=np.float64)
+    matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
+    each = np.arange(matrix.shape[-1])
+    if len(each) > _SMALL:
+        # Rounding may have made a matrix singular.
+        matrix[:, each, each] *= 1 + 1e-14
+        # Of problems that went on after they were settled, which no longer count.
+        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
+        return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
+    inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
+    least = 1e-15 * inverse[each, each]
+    # The sweep operator (Goodnight 1979), which leaves the negative inverse.
+    for k in range(len(each)):
+        # Where rounding made a matrix indefinite, t still grows along the direction.
+        pivot = np.maximum(inverse[k, k], least[k])
+        column = inverse[k].copy()
+        row = column / pivot
+        inverse -= column[:, None] * row
+        inverse[k] = row
+        inverse[:, k] = row
+        inverse[k, k] = -1 / pivot
+    return -inverse
 
 
 def _pulled(matrix: Array, weights: Array) -> Array:

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 import torch
 
+from cnfp_torchrl.geometry.anchor.closed_form import maximize_slack_over_box
 from cnfp_torchrl.geometry.anchor.cutting_planes import maximize_slack_by_cuts
 from cnfp_torchrl.geometry.anchor.interior_point import Best, Settled, maximize_slack
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
@@ -39,13 +40,12 @@ class Intersection:
     plain: tuple[int, ...]
 
     @classmethod
-    def of(cls, sets: Sequence[ConstraintSet], near: Array | None = None) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet], widths: Sequence[int] | None = None) -> Self:
         """Describe sets of batch shape ``(B,)`` in any dtype, on any device.
 
         Args:
             sets: the first is the finite box of action bounds.
-            near: of non-convex sets the parts near these points count, ``(B, d)``; None means those
-                that `ConstraintSet.superlevel` describes.
+            widths: number of rows of each set; None counts them.
 
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
@@ -58,11 +58,10 @@ class Intersection:
             for name, field in constraint_set.fields().items():
                 if np.isnan(field.detach().numpy()).any():
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
-        middle = (bounds.low + bounds.high) / 2
-        widths = tuple(
-            int(s.row_slacks(middle).shape[-1]) if type(s).has_rows() else 1 for s in wide
-        )
-        return cls._described(wide, widths, near)
+        if widths is None:
+            slacks = [s.row_slacks(bounds.low) if type(s).has_rows() else None for s in wide]
+            widths = [1 if slack is None else slack.shape[-1] for slack in slacks]
+        return cls._described(wide, tuple(widths), None)
 
     def near(self, point: Array) -> Self:
         """Return the intersections with the convex parts near points ``(B, d)`` in their place."""
@@ -143,7 +142,9 @@ class Intersection:
         at = self.described
         problem = self.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
         if not self.plain:
-            return maximize_slack(problem, start, settled)
+            over_box = not trial[:, self.rows_of(0)].any()
+            solve = maximize_slack_over_box if over_box else maximize_slack
+            return solve(problem, start, settled)
         sets = [self.sets[i] for i in self.plain]
         rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(

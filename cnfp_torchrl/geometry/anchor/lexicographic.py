@@ -144,7 +144,7 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
             found, left = refined.select(hard), left[hard]
     if len(left):
         margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
-        searched = Search.of(sets, torch.cat(depths, -1), margin).run(found.anchor, found.upper)
+        searched = Search.of(sets, depths, margin).run(found.anchor, found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active.to(active.device))
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
@@ -208,7 +208,7 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Cheby
 
     best = everything.maximize(np.zeros(rows.shape), rows, rows, middle, settled)
     like = next(iter(sets[0].fields().values()))
-    return ChebyshevCenter(*(torch.from_numpy(value).to(like.device) for value in best))
+    return ChebyshevCenter(*(torch.from_numpy(value).to(like.device) for value in best[:3]))
 
 
 def _is_described(constraint_set: ConstraintSet) -> bool:

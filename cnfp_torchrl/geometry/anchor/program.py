@@ -71,7 +71,7 @@ class Program:
         batch, dim = bounds.low.shape
         low, high = batch_last(bounds.low, batch, 1), batch_last(bounds.high, batch, 1)
         middle, half = (low + high) / 2, (high - low) / 2
-        unit = half.mean(0)
+        unit = half.sum(0) / dim
         terms = len(sums) * dim
         width = dim + 1 + terms
         reach = np.zeros((terms, batch))

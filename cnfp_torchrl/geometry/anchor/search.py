@@ -13,9 +13,10 @@ from torch import Tensor
 from cnfp_torchrl.geometry.anchor.interior_point import Best
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
+from cnfp_torchrl.geometry.anchor.retreat import retreat
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
-SHARE = 0.6
+SHARE = 0.45
 """The share of the best slack that a searched anchor has."""
 
 PRECISION = 0.02
@@ -62,6 +63,7 @@ class Search:
         low, high = everything.bounds
         self.everything, self.depth, self.leeway = everything, depth, leeway
         self.kept = (low + high) / 2
+        self.upper = np.full(len(depth), np.inf)
         self.relaxation = np.zeros_like(depth)
         self.far = depth >= _FAR * np.sqrt(np.square(high - low).sum(-1, keepdims=True))
         self.far[:, everything.rows_of(0)] = False
@@ -72,10 +74,10 @@ class Search:
     # Compilers would trace NumPy's arithmetic as their own.
     @classmethod
     @torch.compiler.disable
-    def of(cls, sets: Sequence[ConstraintSet], depth: Tensor, leeway: Tensor) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet], depths: Sequence[Tensor], leeway: Tensor) -> Self:
         """Return the search for sets in any dtype, on any device."""
-        numbers = (value.double().cpu().numpy() for value in (depth, leeway))
-        return cls(Intersection.of(sets), *numbers)
+        numbers = (value.double().cpu().numpy() for value in (torch.cat(list(depths), -1), leeway))
+        return cls(Intersection.of(sets, [depth.shape[-1] for depth in depths]), *numbers)
 
     @torch.compiler.disable
     def run(self, start: Tensor, upper: Tensor) -> Anchored:
@@ -103,22 +105,29 @@ class Search:
         possible = upper > -self.depth.min(-1)
         left = (possible if all(self.everything.convex) else ~fits).nonzero()[0]
         if len(left):
-            some = Search(self.everything.select(left), self.depth[left], self.leeway[left])
+            some = self._select(left)
             # From afar, as float64 sees it, nothing can be told of what is near.
             near = np.abs(start[left] - some.kept) <= some.everything.program.half.T
             some.kept = np.where(near.all(-1, keepdims=True), start[left], some.kept)
             fits[left] = some._fit(~some.far)
-            self.kept[left] = some.kept
+            self.kept[left] = np.where(fits[left][:, None], some.kept, self.kept[left])
         # Far rows hold or give way wherever the anchor is.
         if self.far.any():
             rooms = self.everything.row_slacks(self.kept) - self.depth
             fits = fits & ((rooms >= 0) | ~self.far).all(-1)
         left = (~fits).nonzero()[0]
         if len(left):
-            rest = Search(self.everything.select(left), self.depth[left], self.leeway[left])
+            rest = self._select(left)
             rest._relax()
             self.kept[left], self.relaxation[left] = rest.kept, rest.relaxation
             self.dropped[left] = rest.dropped
+
+    def _select(self, index: Index) -> Search:
+        """Return the search for some states, from where it is now."""
+        some = Search(self.everything.select(index), self.depth[index], self.leeway[index])
+        some.kept, some.relaxation = self.kept[index], self.relaxation[index]
+        some.counts, some.dropped = self.counts[index], self.dropped[index]
+        return some
 
     def _relax(self) -> None:
         """Decide one set after the other, and then the anchor."""
@@ -142,7 +151,13 @@ class Search:
                 self.dropped[:, k] = left
                 rows = rows & ~left[:, None]
             self.counts = self.counts | rows
-        self._fit(self.counts)
+        rooms = self.everything.row_slacks(self.kept) - (self.depth - self.relaxation)
+        least, depth = (np.where(self.counts, v, np.inf).min(-1) for v in (rooms, self.depth))
+        left = (~_is_deep(least, self.upper, depth)).nonzero()[0]
+        if len(left):
+            some = self._select(left)
+            some._fit(some.counts)
+            self.kept[left] = some.kept
 
     def _give_way(self, k: int, trial: Flags) -> None:
         """Relax the rows on trial by lexicographic minimax."""
@@ -161,22 +176,21 @@ class Search:
                 near = wanted[index]  # noqa: B023 - called before it changes
                 return (lower >= near) | (upper - lower <= near)
 
-            before, leeway = self.kept[left], self.leeway[left]
-            best = some.maximize(needs, tried, counts[left] | tried, before, settled)
+            on = counts[left] | tried
+            best = some.maximize(needs, tried, on, self.kept[left], settled)
             rooms = some.row_slacks(best.action) - needs
             least = np.where(tried, rooms, np.inf).min(-1)
             gives = least <= wanted / 4
             binding = tried & (rooms <= (least + 5 * wanted)[:, None]) & gives[:, None]
-            amount = (leeway - least)[:, None]
-            self.relaxation[left] = np.where(binding, amount, self.relaxation[left])
-            # Back towards where it came from, by what half of the leeway allows: Newton's method is
-            # slow to leave the boundaries that the best point lies on.
-            rooms = some.row_slacks(before) - needs
-            short = least - np.where(binding, rooms, np.inf).min(-1)
-            share = np.where(gives, leeway / (2 * leeway + 2 * np.maximum(short, 0)), 0.0)
-            self.kept[left] = best.action + share[:, None] * (before - best.action)
-            counts[left] = counts[left] | binding
+            given = np.where(binding, (self.leeway[left] - least)[:, None], self.relaxation[left])
             trial[left] = tried & ~binding & gives[:, None]
+            counts[left] = counts[left] | binding
+            # Newton's method is slow to leave the boundaries that the best point lies on.
+            gain = given - self.relaxation[left]
+            self.relaxation[left] = given
+            sure = on & ~trial[left]
+            self.kept[left], upper = retreat(some, best, self.kept[left], needs, gain, on, sure)
+            self.upper[left] = np.where(gives, upper, self.upper[left])
 
     def _fit(self, rows: Flags) -> Flags:
         """Move to points well inside of some rows where there are such, and tell where.
@@ -221,8 +235,7 @@ class Search:
 
         def settled(lower: Array, upper: Array, at: Index) -> Flags:
             h = depth[at]
-            deep = (lower >= 0) & (lower + h >= SHARE * (upper + h))
-            return (upper < 0) | deep | (upper - lower <= 1e-3 * h)
+            return (upper < 0) | _is_deep(lower, upper, h) | (upper - lower <= 1e-3 * h)
 
         return part.maximize(required, chosen, chosen, self.kept[index], settled)
 
@@ -238,3 +251,8 @@ class Search:
                 gauges = np.stack([s.gauge(along, start).numpy() for s in sets], -1)
                 gauge = np.where(counts, gauges, 0.0).max(-1, keepdims=True)
                 yield point + direction * (0.5 / gauge)
+
+
+def _is_deep(slack: Array, upper: Array, depth: Array) -> Flags:
+    """Tell where slacks beyond the depth are a large share of the best one, by its bounds."""
+    return np.asarray((slack >= 0) & (slack + depth >= SHARE * (upper + depth)))

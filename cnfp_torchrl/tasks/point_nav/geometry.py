@@ -90,6 +90,8 @@ class PointNavGeometry(GeometryTransform):
         """Return the way to the nearest station, which both constraints of a state ask for."""
         global _last_way
         observation, layout = tensordict.get(self.in_keys[0]), self.layout
+        if torch.compiler.is_compiling():
+            return self.path.to_station(read_position(tensordict, self.in_keys[0]))
         known = _last_way
         if known is not None and known.is_of(observation, layout):
             return known.way
@@ -132,25 +134,25 @@ class ObstacleGeometry(PointNavGeometry):
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
-        position, way = read_position(tensordict, self.in_keys[0]), self.way(tensordict)
-        distance, separates = way.side_distances, way.separates
-        eligible = separates | ~separates.any(-1, keepdim=True)
-        side = torch.where(eligible, distance, -torch.inf).argmax(-1, keepdim=True)
-        chosen = torch.zeros_like(eligible).scatter(-1, side, value=True)
-
-        walls = torch.cat([self.layout.wall - position, self.layout.wall + position], dim=-1)
-        open_to = torch.where(chosen, distance, torch.inf)
-        room = torch.cat([open_to, walls.unsqueeze(-2)], dim=-2).amin(-2) - MARGIN
-        high, low = (room / self.layout.step_length).split(2, dim=-1)
+        way = self.way(tensordict)
+        distance, last = way.side_distances, (None,) * way.found.ndim
+        separates = way.separating.amax(1, keepdim=True) > 0
+        eligible = torch.where(separates, way.separating, distance)
+        eligible = eligible - self.path.precedence[:, *last]
+        chosen = eligible == eligible.amax(1, keepdim=True)
+        # No room is left beside the chosen side of a rectangle that is touched.
+        free = distance.masked_fill(distance.amax(1, keepdim=True) <= 0, -torch.inf)
+        # The last ones are the walls, all of which count.
+        room = torch.minimum(torch.where(chosen, free, torch.inf).amin(0), distance[-1])
+        high, low = ((room - MARGIN) / self.layout.step_length).movedim(0, -1).split(2, -1)
         low = -low
 
-        touching = (distance <= 0).all(-1, keepdim=True) & chosen
-        leave_x, leave_y = touching.any(-2).unflatten(-1, (2, 2)).any(-2).unbind(-1)
-        beyond = torch.stack([leave_x, leave_y], dim=-1) | (low >= 1) | (high <= -1) | (low >= high)
-        outwards = torch.where(low + high >= 0, 1.0, -1.0) * (_BEYOND + 0.5)
+        outwards = torch.where(low + high >= 0, _BEYOND + 0.5, -_BEYOND - 0.5)
+        low, high = low.clamp(-1, 1), high.clamp(-1, 1)
+        beyond = low >= high
         return Box(
-            torch.where(beyond, outwards - 0.5, low.clamp(min=-1)),
-            torch.where(beyond, outwards + 0.5, high.clamp(max=1)),
+            torch.where(beyond, outwards - 0.5, low),
+            torch.where(beyond, outwards + 0.5, high),
             validate_args=False,
         )
 
@@ -217,8 +219,9 @@ class BatteryGeometry(PointNavGeometry):
         """Return the ball of allowed moves (docs/method.md, section 4)."""
         position, battery = self.read(tensordict)
         way = self.way(tensordict)
-        steps_left = battery - 1 - self.layout.battery_threshold
-        reach = CAUTIOUS * (self.layout.zone_radius + self.layout.step_length * steps_left)
+        steps_left = battery - (1 + self.layout.battery_threshold)
+        step, zone = CAUTIOUS * self.layout.step_length, CAUTIOUS * self.layout.zone_radius
+        reach = step * steps_left + zone
         radius = torch.maximum(reach - way.rest, way.turning_radius) / self.layout.step_length
         center = (way.waypoint - position) / self.layout.step_length
 

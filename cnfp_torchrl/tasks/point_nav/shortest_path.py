@@ -41,11 +41,13 @@ class StationWay(NamedTuple):
     turning_radius: Tensor
     """The distance from the waypoint within which all is visible that is visible from it; 0 at a
     station; ``(*batch,)``."""
-    separates: Tensor
-    """Which sides (x_low, y_low, x_high, y_high) of each rectangle separate it from both the
-    position and the waypoint, bool ``(*batch, R, 4)``; all false where no way was found."""
     side_distances: Tensor
-    """The position's `side_distances`, ``(*batch, R, 4)``."""
+    """The distances to the prolonged sides (x_low, y_low, x_high, y_high) of each rectangle,
+    positive outside, and of all beyond the walls, positive inside, ``(R + 1, 4, *batch)``: over
+    first dimensions reductions are fastest."""
+    separating: Tensor
+    """The same for sides that the waypoint lies beyond, -inf for others and where no way was found:
+    positive where a side separates its rectangle from both the position and the waypoint."""
     found: Tensor
     """False inside rectangles and where no separable way exists, bool ``(*batch,)``; the waypoint
     is then the station nearest in a straight line."""
@@ -69,13 +71,15 @@ class ShortestPath(nn.Module):
     """
 
     rectangles: Tensor
-    nodes: Tensor
-    node_rest: Tensor
-    node_turning_radius: Tensor
-    node_clear: Tensor
-    node_detours: Tensor
+    sides: Tensor
     side_codes: Tensor
+    precedence: Tensor
     first_rows: Tensor
+    node_x: Tensor
+    node_y: Tensor
+    node_lengths: Tensor
+    node_table: Tensor
+    far: Tensor
     corners: Tensor
     corner_lengths: Tensor
 
@@ -91,26 +95,23 @@ class ShortestPath(nn.Module):
 
     def to_station(self, position: Tensor) -> StationWay:
         """Return the way to the nearest station from positions ``(*batch, 2)``."""
-        distances = side_distances(position, self.rectangles)
-        outside = distances > 0
+        x, y = position.unbind(-1)
+        last = (None,) * x.ndim
+        distances = torch.stack([-x, -y, x, y]) + self.sides[..., *last]
         # The sides that a rectangle is seen from tell which nodes are separable from it: looked up,
         # not compared side by side with each node.
-        seen_from = (outside * self.side_codes).sum(-1) + self.first_rows
-        detours = embedding(seen_from, self.node_detours).sum(-2)
-        x, y = position.unsqueeze(-2).unbind(-1)
-        distance = torch.hypot(x - self.nodes[:, 0], y - self.nodes[:, 1])
-        shortest, node = (distance + self.node_rest + detours).min(-1)
-        found = shortest.isfinite()
-        nearest_station = distance[..., : len(self.layout.stations)].argmin(-1)
-        node = torch.where(found, node, nearest_station)
-        sides = outside & self.node_clear[node] & found[..., None, None]
+        seen_from = ((distances > 0) * self.side_codes[:, *last]).sum(1, dtype=torch.int32)
+        lengths = embedding(seen_from + self.first_rows[:, *last], self.node_lengths).amax(0)
+        # Not `torch.hypot`, which takes as long as all of this at large batches.
+        along_x, along_y = x.unsqueeze(-1) - self.node_x, y.unsqueeze(-1) - self.node_y
+        distance = torch.addcmul(along_x.square(), along_y, along_y).sqrt()
+        shortest, node = (distance + lengths).min(-1)
+        found = shortest < self.far
+        known = embedding(node, self.node_table)
+        clear = known[..., 4:].movedim(-1, 0).view_as(distances)
+        separating = torch.where(found, distances + clear, -torch.inf)
         return StationWay(
-            self.nodes[node],
-            self.node_rest[node],
-            self.node_turning_radius[node],
-            sides,
-            distances,
-            found,
+            known[..., :2], known[..., 2], known[..., 3], distances, separating, found
         )
 
     def to_goal(self, position: Tensor, goal: Tensor) -> Tensor:
@@ -170,19 +171,30 @@ class ShortestPath(nn.Module):
         ):
             rest = shorter
         # Sixteen rows for each rectangle: one for each combination of sides that it is seen from.
+        # A station behind one is farther than anything else, so that the nearest of them is gone to
+        # if all are hidden. The arena hides nothing; its rows are the lengths from a node onwards.
+        far = 10 * (layout.wall + rest[rest.isfinite()].amax())
         side_codes = 2 ** torch.arange(4)
         seen_from = (torch.arange(16).unsqueeze(-1) & side_codes) > 0
         separable = (seen_from.unsqueeze(1) & clear.movedim(0, 1).unsqueeze(1)).any(-1)
-        detours = torch.where(separable, zero, torch.inf).flatten(0, 1)
+        hidden = torch.where(separable, zero, torch.where(is_station, far, torch.inf))
+        lengths = torch.cat([hidden.flatten(0, 1), rest.expand(16, -1)])
+        beyond_walls = torch.full((1, 4), layout.wall, dtype=torch.float64)
+        sides = torch.cat([rectangles * torch.tensor([1, 1, -1, -1]), beyond_walls])
+        clear = torch.cat([clear, clear.new_ones(len(nodes), 1, 4)], 1).flatten(1)
+        known = [nodes, rest.unsqueeze(-1), turning_radius.unsqueeze(-1)]
         return [
             ("rectangles", rectangles),
-            ("node_detours", detours),
-            ("side_codes", side_codes),
-            ("first_rows", 16 * torch.arange(len(rectangles))),
-            ("nodes", nodes),
-            ("node_rest", rest),
-            ("node_turning_radius", turning_radius),
-            ("node_clear", clear),
+            ("sides", sides),
+            ("side_codes", side_codes.int()),
+            # By which one of sides that are equally far is preferred.
+            ("precedence", 1e-6 * layout.wall * torch.arange(4.0)),
+            ("first_rows", 16 * torch.arange(len(sides), dtype=torch.int32)),
+            ("node_x", nodes[:, 0]),
+            ("node_y", nodes[:, 1]),
+            ("node_lengths", lengths),
+            ("node_table", torch.cat([*known, torch.where(clear, 0.0, -torch.inf).double()], 1)),
+            ("far", far),
         ]
 
     def _goal_graph(self) -> list[tuple[str, Tensor]]:
