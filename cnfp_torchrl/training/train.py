@@ -277,7 +277,7 @@ def _results(
     reports = {name: result.report(score) for name, result in evaluations.items()}
     counts = dict(training := metrics.counts())
     for result in evaluations.values():
-        counts = {name: each + result.constraints[name] for name, each in counts.items()}
+        counts = {name: count + result.constraints[name] for name, count in counts.items()}
     return {
         "return_mean": reports["stochastic"]["return_mean"],
         "score": reports["stochastic"]["score"],
