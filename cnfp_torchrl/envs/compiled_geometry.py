@@ -37,7 +37,9 @@ class CompiledGeometry:
         keys = [key for geometry in geometries for key in geometry.in_keys]
         keys += [key for b in bijectors if b.name not in published for key in b.geometry_keys]
         self._keys = list(dict.fromkeys([*keys, SAFE_ACTION_KEY]))
-        self._compiled = torch.compile(self._computed, dynamic=False, isolate_recompiles=True)
+        self._compiled = torch.compile(  # type: ignore[call-overload]  # unknown to its overloads
+            self._computed, dynamic=False, isolate_recompiles=True
+        )
 
     def __call__(self, states: TensorDictBase) -> tuple[Begun, Tensor]:
         """Publish the sets in some states, and anchors for the case that all of them are found.

@@ -31,11 +31,12 @@ class Outlines:
     or the shadow that the set casts on the plane.
 
     Args:
-        region: of one state, best in float64.
-        components: one or two components of the action.
-        rays: at equal angles; the corners of boxes have rays of their own.
-        shadows: take shadows, not sections; slow, and shadows of single sets are those of the part
-            within the action bounds, because that of a half-space alone would not show it.
+        region: The region of one state, best in float64.
+        components: One or two components of the action.
+        rays: The number of rays at equal angles; the corners of boxes have rays of their own.
+        shadows: Whether shadows are taken, and not sections; slow, and shadows of single sets are
+            those of the part within the action bounds, because that of a half-space alone would not
+            show it.
     """
 
     def __init__(
@@ -118,9 +119,9 @@ def set_outline(allowed: ConstraintSet, view: View, nodes: int = 400) -> list[Li
     region.
 
     Args:
-        allowed: the set, of batch shape ``()`` and dimension 2.
-        view: outside of it nothing is drawn.
-        nodes: of the grid along each axis.
+        allowed: The set, of batch shape ``()`` and dimension 2.
+        view: The view, outside of which nothing is drawn.
+        nodes: The number of nodes of the grid along each axis.
     """
     x_low, x_high, y_low, y_high = view
     x = torch.linspace(x_low, x_high, nodes, dtype=torch.float64)
@@ -139,8 +140,8 @@ def region_outline(region: Region, applied: Sequence[int]) -> Line:
     In more than two dimensions it is the boundary of the shadow on the first two components.
 
     Args:
-        region: of batch shape ``()`` and dimension 2 or more.
-        applied: indices into its sets; those that are not active are left out.
+        region: A region of batch shape ``()`` and dimension 2 or more.
+        applied: The indices into its sets; those that are not active are left out.
     """
     return Outlines(region.to(torch.float64), (0, 1), rays=1440, shadows=True).of_intersection(
         applied

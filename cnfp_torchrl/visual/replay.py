@@ -28,9 +28,9 @@ def replay_step(
     last stage stands the recorded action, bit by bit.
 
     Args:
-        actor: from `make_constrained_actor` or `constrain`.
-        transition: of batch size ``()``, with geometry and action; not changed.
-        noise: standard Gaussian, ``(n, d)``, for the other samples.
+        actor: A constrained actor, from `make_constrained_actor` or `constrain`.
+        transition: A transition of batch size ``()``, with geometry and action; not changed.
+        noise: Noise of the standard Gaussian, ``(n, d)``, for the other samples.
 
     Raises:
         ValueError: when the transition is a batch.

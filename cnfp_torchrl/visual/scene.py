@@ -35,10 +35,12 @@ class Detail:
     """How fine a scene is computed.
 
     Args:
-        cells: of the density's grid along each axis, and a quarter of those in one dimension.
-        rays: of outlines.
-        nodes: along each axis of the grid that outlines of dropped sets are traced on.
-        shadows: in more than two dimensions, draw the shadows of sets and not sections; slow.
+        cells: The number of cells of the density's grid along each of two axes; four times as many
+            in one dimension.
+        rays: The number of rays of outlines.
+        nodes: The number of nodes along each axis of the grid that dropped sets are traced on.
+        shadows: Whether the shadows of sets are drawn in more than two dimensions, and not
+            sections; slow.
     """
 
     cells: int = 40
@@ -54,13 +56,13 @@ class SetsOnMap(NamedTuple):
     """Where the agent stands and where the allowed actions would lead it.
 
     Args:
-        position: of the agent, ``(2,)``.
-        goal: where it has to go, ``(2,)``, or None.
-        sets: the boundary of each constraint's set, none of dropped ones.
-        dropped: the boundary of each dropped constraint's set, none of the others.
-        allowed: the boundary of the allowed moves.
-        targets: where the samples lead, ``(n, 2)``.
-        move: of the followed action, ``(2,)``.
+        position: The position of the agent, ``(2,)``.
+        goal: The goal, where it has to go, ``(2,)``, or None.
+        sets: The boundary of each constraint's set, none of dropped ones.
+        dropped: The boundary of each dropped constraint's set, none of the others.
+        allowed: The boundary of the allowed moves.
+        targets: The points that the samples lead to, ``(n, 2)``.
+        move: The move of the followed action, ``(2,)``.
     """
 
     position: NDArray[np.float64]
@@ -76,10 +78,10 @@ class Scene:
     """One step of a flow policy, as arrays, each computed when it is first asked for.
 
     Args:
-        setting: that of all steps.
-        snapshot: what happened; the followed sample is the executed action.
-        detail: how fine.
-        actions: the grid of `Setting.grid`; None makes it anew.
+        setting: The setting of all steps.
+        snapshot: The snapshot, of which the followed sample is the executed action.
+        detail: The fineness of what is drawn.
+        actions: The grid of `Setting.grid`; None makes it anew.
     """
 
     def __init__(
@@ -201,7 +203,7 @@ class Scene:
         """Return the sets and some samples at the agent's position; None for a task without a map.
 
         Args:
-            targets: number of samples.
+            targets: The number of samples.
         """
         view, samples = self.setting.view, self.snapshot.stages[-1].samples
         plane = view.map
@@ -268,9 +270,9 @@ def base_density(snapshot: FlowSnapshot, spread: float, cells: int) -> tuple[Ten
     """Return a grid of latents around the Gaussian's mean, and its log-density there.
 
     Args:
-        snapshot: of one or two dimensions.
-        spread: how far the grid goes, in standard deviations.
-        cells: along each axis.
+        snapshot: A snapshot of one or two dimensions.
+        spread: The reach of the grid, in standard deviations.
+        cells: The number of cells along each axis.
 
     Returns:
         Latents ``(cells, 1)`` or ``(cells, cells, 2)``, and log-densities without the last axis.

@@ -27,12 +27,13 @@ class Stage:
     """What one stage of a flow made of the base samples.
 
     Args:
-        name: of the constraint, or ``bounds``.
-        samples: ``(n, d)``.
-        log_density: of those samples in the distribution after this stage, ``(n,)``.
-        applied: indices into the region's sets of those applied so far, this one last.
-        relaxation: by how much the constraint's set had to be widened to hold in this state;
-            infinite for one that is dropped and changes nothing.
+        name: The name of the constraint, or ``bounds``.
+        samples: The samples, ``(n, d)``.
+        log_density: The log-density of those samples in the distribution after this stage,
+            ``(n,)``.
+        applied: The indices into the region's sets of those applied so far, this one last.
+        relaxation: The amount by which the constraint's set had to be widened to hold in this
+            state; infinite for one that is dropped and changes nothing.
     """
 
     name: str
@@ -54,22 +55,22 @@ class FlowSnapshot:
     The first sample is the executed one, and its path is followed unless another is chosen.
 
     Args:
-        state: the state, as the actor saw it, of batch size ``()``.
-        loc: of the Gaussian base, ``(d,)``.
-        scale: of the Gaussian base, ``(d,)``.
-        latents: base samples, ``(n, d)``.
-        latent_log_density: ``(n,)``.
-        stages: in order of application.
-        region: sets as they are applied in this state, widened where they are relaxed
+        state: The state, as the actor saw it, of batch size ``()``.
+        loc: The location of the Gaussian base, ``(d,)``.
+        scale: The scale of the Gaussian base, ``(d,)``.
+        latents: The base samples, ``(n, d)``.
+        latent_log_density: The log-density of the base samples, ``(n,)``.
+        stages: The stages in order of application.
+        region: The sets as they are applied in this state, widened where they are relaxed
             (``sets[0]`` the action bounds), anchor, and which sets are not dropped.
-        relaxation: by how much each of its sets is widened; infinite where it is dropped.
-        through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
+        relaxation: The amount by which each of its sets is widened; infinite where it is dropped.
+        through_stages: A map of further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
-        log_densities: of further actions ``(n, d)`` after each stage, ``(stages, n)``; -inf where
-            there is none.
-        head: the policy's flow module.
-        followed: index of the sample whose path through the stages is drawn.
-        is_recovered: whether the path of an executed action is known; an action outside the flow's
+        log_densities: The log-densities of further actions ``(n, d)`` after each stage, ``(stages,
+            n)``; -inf where there is none.
+        head: The policy's flow module.
+        followed: The index of the sample whose path through the stages is drawn.
+        is_recovered: Whether the path of an executed action is known; an action outside the flow's
             support, which another policy may have taken, has none and seems to stand still.
     """
 
@@ -181,10 +182,10 @@ def take_snapshot(
     """Return what a constrained actor does in one state.
 
     Args:
-        actor: from `make_constrained_actor` or `constrain`.
-        state: of batch size ``()``, with geometry, anchor and active flags; not changed.
-        samples: how many base samples to draw.
-        seed: of those; torch's global generator is left alone.
+        actor: A constrained actor, from `make_constrained_actor` or `constrain`.
+        state: A state of batch size ``()``, with geometry, anchor and active flags; not changed.
+        samples: The number of base samples.
+        seed: The seed of those; torch's global generator is left alone.
 
     Raises:
         ValueError: when the state is a batch.
@@ -207,10 +208,10 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     """Return the snapshot of a state in which a policy has written its Gaussian.
 
     Args:
-        head: the flow module of the policy.
-        state: of batch size ``()``, with location, scale and geometry; where anchor and active
-            flags are missing, which only exact flows need, they are computed here.
-        noise: standard Gaussian, ``(n, d)``.
+        head: The flow module of the policy.
+        state: A state of batch size ``()``, with location, scale and geometry; where anchor and
+            active flags are missing, which only exact flows need, they are computed here.
+        noise: Noise of the standard Gaussian, ``(n, d)``.
     """
     loc, scale = (state.get(key) for key in head.parameter_keys)
     base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
@@ -292,9 +293,9 @@ class StagedFlow:
     """The bijectors of a flow up to each of its stages.
 
     Args:
-        flow: how the sets are combined.
-        region: of one state.
-        applied: for each stage, indices into the region's sets of those applied so far.
+        flow: The way in which the sets are combined.
+        region: The region of one state.
+        applied: The indices, for each stage, into the region's sets of those applied so far.
     """
 
     def __init__(self, flow: Flow, region: Region, applied: Sequence[Sequence[int]]) -> None:
@@ -344,9 +345,9 @@ def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Biject
     """Return the bijector of a flow up to a stage.
 
     Args:
-        flow: how the sets are combined.
-        region: of one state.
-        applied: indices into the region's sets of those applied so far.
+        flow: The way in which the sets are combined.
+        region: The region of one state.
+        applied: The indices into the region's sets of those applied so far.
     """
     chosen = [0, *(k for k in applied if k > 0)]
     active = None if region.active is None else region.active[..., chosen]

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from anchor_times import problem
+from anchor_times import facing_rows
 from interleaved import Rows, compared, processor, rounds, versions, write
 from torch import Tensor
 from torch.func import jacrev, vmap
@@ -325,7 +325,7 @@ def problems(batch: int, skip: tuple[str, ...]) -> dict[str, tuple[list[Any], di
     random = torch.Generator().manual_seed(1)
     wished = 1.5 * torch.randn(batch, 6, generator=random, dtype=torch.float64)
     found = {}
-    rows = [part.to(torch.float64) for part in problem(batch, 6, 1)]
+    rows = [part.to(torch.float64) for part in facing_rows(batch, 6, 1)]
     region = Region.build(rows)
     layers = ours(rows, wished, with_rows=True)
     layers["Dykstra, 50 rounds"] = of_torch(projected(rows, region), wished)

@@ -56,7 +56,7 @@ def audit_figure(report: AuditReport) -> Figure:
     tried there.
 
     Args:
-        report: of `cnfp_torchrl.audit.audit`.
+        report: The report of `cnfp_torchrl.audit.audit`.
     """
     colors = constraint_colors(report.order) | {TOGETHER: INK}
     scenes = [scene for scene in report.worst_states if scene.actions.shape[-1] == 2][:_MOST_SCENES]

@@ -39,7 +39,7 @@ def read_scalars(metrics: Path) -> dict[str, Curve]:
     """Return the logged scalars by name, such as ``train/return``; none if there is no such folder.
 
     Args:
-        metrics: the folder of the CSV logger's experiment, which holds ``scalars/``.
+        metrics: The folder of the CSV logger's experiment, which holds ``scalars/``.
 
     Raises:
         ValueError: when a file is not rows of step and value, naming it.
@@ -70,9 +70,9 @@ def learning_curves(
     the figure of a run without any scalars.
 
     Args:
-        curves: steps and values by name, see `read_scalars`.
-        colors: of the constraints; None chooses them by the names found.
-        title: above the panels.
+        curves: Steps and values by name, see `read_scalars`.
+        colors: The colors of the constraints; None chooses them by the names found.
+        title: The title above the panels.
     """
     if not curves:
         return message_figure(

@@ -37,9 +37,9 @@ def draw_map(axes: Axes, plane: Map, *, labels: bool = True) -> None:
     """Draw what stands in a map, in its units.
 
     Args:
-        axes: an empty panel.
-        plane: the map.
-        labels: name the axes.
+        axes: An empty panel.
+        plane: The map.
+        labels: Whether the axes are named.
     """
     (x_low, x_high), (y_low, y_high) = plane.x, plane.y
     inside = Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, transform=axes.transData)
@@ -80,9 +80,9 @@ def draw_moves(axes: Axes, scene: Scene, colors: Mapping[str, str]) -> None:
     """Draw the map with each constraint's set, and where the agent may move.
 
     Args:
-        axes: an empty panel.
-        scene: of a task with a map.
-        colors: of the constraints.
+        axes: An empty panel.
+        scene: A scene of a task with a map.
+        colors: The colors of the constraints.
     """
     view, shown = scene.setting.view, scene.on_map(targets=0)
     assert view.map is not None

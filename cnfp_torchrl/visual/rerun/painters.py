@@ -49,9 +49,9 @@ def _log_axes(
     """Log the titles of the axes, below the frame and above it: Rerun's views have none.
 
     Args:
-        drawn: where to log.
-        titles: of the axis to the right and, if there is one, of that upwards.
-        positions: the upper ends of the titles.
+        drawn: The entities to log to.
+        titles: The titles of the axis to the right and, if there is one, of that upwards.
+        positions: The upper ends of the titles.
     """
     labels = [f"{arrow} {title}" for arrow, title in zip("→↑", titles, strict=False)]
     points = rr.Points2D(positions, labels=labels, colors=style.MUTED, radii=0.0, show_labels=True)
@@ -62,10 +62,10 @@ class PlanePainter:
     """Density, samples, sets and the executed action's path after a stage, in a plane.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        view: which stage, which components.
-        cells: of the density's grid along each axis.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        view: The view, of a stage and components.
+        cells: The number of cells of the density's grid along each axis.
     """
 
     def __init__(
@@ -161,9 +161,9 @@ class LinePainter:
     below 0, and below them lies a bar for the interval of each constraint applied so far.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        view: which stage.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        view: The view of a stage.
     """
 
     def __init__(self, stream: rr.RecordingStream, setting: Setting, view: StageView) -> None:
@@ -227,9 +227,9 @@ class MapPainter:
     """The task's map: what stands in it, the goal, the agent with its trail and allowed moves.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        plane: the map.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        plane: The map.
     """
 
     def __init__(self, stream: rr.RecordingStream, setting: Setting, plane: Map) -> None:

@@ -35,8 +35,8 @@ class Viewer(ABC):
     """A viewer, or a server for viewers, that listens at an address for a recording.
 
     Args:
-        host: where it listens.
-        port: where it listens.
+        host: The host that it listens at.
+        port: The port that it listens at.
     """
 
     stays_open: ClassVar[bool] = False
@@ -84,7 +84,7 @@ class RunningViewer(Viewer):
     """A viewer that runs already, here or behind a tunnel: start one with ``rerun``.
 
     Args:
-        url: where it listens, ``rerun+http://HOST:PORT/proxy``.
+        url: The address that it listens at, ``rerun+http://HOST:PORT/proxy``.
 
     Raises:
         SinkError: when that is no address of a viewer.
@@ -134,11 +134,11 @@ class WebViewer(Viewer):
     """Rerun's web viewer for a browser, served while the recording is open.
 
     Args:
-        web_port: of the page.
-        port: of the data that the page fetches.
-        host: the address to listen at; everybody who reaches it can look.
-        memory_limit: of the data kept for those who come later, such as ``256MiB``; the oldest are
-            dropped. The file keeps everything.
+        web_port: The port of the page.
+        port: The port of the data that the page fetches.
+        host: The address to listen at; everybody who reaches it can look.
+        memory_limit: The memory limit of the data kept for those who come later, such as
+            ``256MiB``; the oldest are dropped. The file keeps everything.
     """
 
     def __init__(
@@ -184,9 +184,9 @@ class ViewerWindow(Viewer):
     """A window of its own, which stays open when the recording ends.
 
     Args:
-        memory_limit: of the window, such as ``1GiB``; the oldest data are dropped.
-        port: where it listens, on loopback; None takes a free one.
-        arguments: further ones for ``rerun``, such as ``--renderer=gl``.
+        memory_limit: The memory limit of the window, such as ``1GiB``; the oldest data are dropped.
+        port: The port that it listens at, on loopback; None takes a free one.
+        arguments: Further arguments for ``rerun``, such as ``--renderer=gl``.
     """
 
     stays_open = True
