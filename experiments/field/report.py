@@ -171,8 +171,8 @@ def compared(records: Sequence[Record], task: str) -> list[str]:
     (mine, my_name), (theirs, their_name) = found[True], found[False]
     verdict = "at least that of" if mine >= theirs else "below"
     return [
-        f"Of these runs, the best of ours by stochastic return ({my_name}) has {mine:,.0f}, {verdict} "
-        f"the best constrained peer's ({their_name}), {theirs:,.0f}.",
+        f"Of these runs, the best of ours by stochastic return ({my_name}) has {mine:,.0f}, "
+        f"{verdict} the best constrained peer's ({their_name}), {theirs:,.0f}.",
         "",
     ]
 
