@@ -83,8 +83,8 @@ def _refuse_unfaithful(
     """Refuse a copy that does not do what its original did: some start afresh (EzPickle)."""
     with torch.random.fork_rng(devices=[]):
         torch.set_rng_state(noise)
-        told = copy.deepcopy(twin).step(before.clone())
-    if (key := difference(env, transition.get("next"), told.get("next"))) is not None:
+        repeated = copy.deepcopy(twin).step(before.clone())
+    if (key := difference(env, transition.get("next"), repeated.get("next"))) is not None:
         raise TypeError(f"{_expected(env)}, but its copy steps to another {key!r}; {_REMEDY}")
 
 

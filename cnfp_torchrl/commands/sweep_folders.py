@@ -98,7 +98,7 @@ def planned_runs(folder: Path) -> dict[Path, list[str]]:
 
 
 def config_arguments(folder: Path) -> list[str]:
-    """Return the arguments by which a sweep was told of configurations of one's own."""
+    """Return the arguments that gave a sweep the folder of the user's own configurations."""
     path = folder / MULTIRUN
     if not path.is_file():
         return []

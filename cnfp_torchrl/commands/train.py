@@ -120,8 +120,8 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
 def _main(config: DictConfig) -> float:
     """Train, draw the run's figures, print the summary, and return what a sweep maximizes."""
     folder, config = _folder_and_config(config)
-    # A sweep tells of its runs that were refused, also when they are tried again.
-    is_told = is_sweep() or folder.load_failure() is not None
+    # The table of a sweep has its runs that were refused, also when they are tried again.
+    is_in_table = is_sweep() or folder.load_failure() is not None
     try:
         draw: Callable[[RunFolder], object] | None = instantiate(config.figures) or None
         summary = train(config, folder, resume=folder.has_started)
@@ -130,11 +130,11 @@ def _main(config: DictConfig) -> float:
         sys.exit(128 + stop.number)
     except Exception as error:
         # A complete run has not failed because it was asked to go on.
-        if (is_told or folder.has_started) and not folder.is_complete:
+        if (is_in_table or folder.has_started) and not folder.is_complete:
             folder.save_failure(error)
         raise
     finally:
-        if not is_told:
+        if not is_in_table:
             _remove_unless_started(folder)
     folder.forget_failure()
     sys.stdout.write(f"{_summary_text(summary)}\n{folder.path}\n")

@@ -61,7 +61,8 @@ def build_environment(
     base: EnvBase = instantiate(config.env.base, **replaced, _convert_="all")
     bare = base.base_env if isinstance(base, TransformedEnv) else base
     if replaced and isinstance(bare, ParallelEnv):
-        base.close()  # each of its environments is a process: no more of them than in training
+        # Each of its environments is a process: no more of them than in training. None has begun.
+        base.close(raise_if_closed=False)
         base = instantiate(config.env.base, _convert_="all")
     if device is not None:
         base = base.to(device)
@@ -76,7 +77,7 @@ def build_environment(
     flow: Flow = instantiate(config.flow)
     if not geometries:
         if flow.is_safe:
-            env.close()
+            env.close(raise_if_closed=False)
             raise ValueError(
                 f"env.geometry: expected at least one constraint for {type(flow).__name__} to keep "
                 "to, given none; name its set there, or train with flow=unconstrained"
