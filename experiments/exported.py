@@ -2,6 +2,8 @@
 
     python -m experiments.exported [--states 100000] [--families NAME ...]
 
+Families that are left out keep their rows of the time before.
+
 The constraint of each policy is one random set of its family in each state, shown as the
 observation. Every certified action has to lie in its set and in the action bounds with zero
 tolerance, and every other one in the bounds: the command fails otherwise.
@@ -10,6 +12,7 @@ tolerance, and every other one in the bounds: the command fails otherwise.
 from __future__ import annotations
 
 import argparse
+import json
 import platform
 import sys
 import tempfile
@@ -29,12 +32,13 @@ from cnfp_torchrl.envs import GeometryTransform
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.installed_versions import installed_versions
 from cnfp_torchrl.training.networks import gaussian_network
-from cnfp_torchrl.whole_file import whole_file
+from cnfp_torchrl.whole_file import whole_file, write_json
 from cnfp_torchrl.wrappers.observed_env import ObservedEnv
 from experiments.resume import markdown
 from tests.geometry.cases import FAMILIES
 
 RESULT = Path(__file__).parent / "results" / "exported.md"
+ROWS = RESULT.with_suffix(".json")
 
 LARGEST = 6
 """The most action components that are tested of a family."""
@@ -133,11 +137,12 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", choices=DIMENSIONS, default=list(DIMENSIONS))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
+    rows = json.loads(ROWS.read_text()) if ROWS.is_file() else {}
     for name in options.families:
-        rows.append(row_of(name, options.states))
-        sys.stdout.write(f"{' | '.join(rows[-1])}\n")
+        rows[name] = row_of(name, options.states)
+        sys.stdout.write(f"{' | '.join(rows[name])}\n")
         sys.stdout.flush()
+        write_json(ROWS, rows)
     packages = installed_versions(["torch", "torchrl", "onnx", "onnxruntime"])
     known = ", ".join(f"{package} {version}" for package, version in packages.items())
     text = (
@@ -147,14 +152,13 @@ def main() -> None:
         f"{options.states:,} states of each family, every one with a random set of its own, in "
         "onnxruntime. Violations are certified actions outside of their set or the action bounds, "
         "with zero tolerance. Times are medians of 100 calls with one state, eager mode and "
-        f"onnxruntime by turns, on one thread of the processor, in its own time.\n\n"
-        f"{markdown([HEADER, *rows])}\n"
+        "onnxruntime by turns, on one thread of the processor, in its own time.\n\n"
+        f"{markdown([HEADER, *(rows[name] for name in DIMENSIONS if name in rows)])}\n"
     )
-    if set(options.families) == set(DIMENSIONS):
-        with whole_file(RESULT) as file:
-            file.write(text.encode())
+    with whole_file(RESULT) as file:
+        file.write(text.encode())
     sys.stdout.write(text)
-    if wrong := [row[0] for row in rows if row[3] != "0" or row[4] != "0"]:
+    if wrong := [row[0] for row in rows.values() if row[3] != "0" or row[4] != "0"]:
         sys.exit(f"actions of {wrong} lie outside of what is allowed")
 
 

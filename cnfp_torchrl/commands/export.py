@@ -58,11 +58,11 @@ def export_run(
     visited = observed_states(policy, env, actor, states)
     export_policy(policy, output, to)  # type: ignore[arg-type]
     run = open_exported(output)
-    one = with_noise(policy, [value[:1] for value in visited])
+    state = with_noise(policy, [value[:1] for value in visited])
     manifest = {
         **read_manifest(output),
         "self_test": self_test(policy, run, visited),
-        "milliseconds_for_one_state": latencies({"eager": policy, to: run}, one),
+        "milliseconds_for_one_state": latencies({"eager": policy, to: run}, state),
     }
     write_manifest(output, manifest)
     return manifest

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from threading import Thread
 from typing import Any
 
 import torch
@@ -168,7 +169,53 @@ class WorkerCollector(ABC):
         self._frames = int(state["frames"])
 
 
-class MultiSync(WorkerCollector):
+class WorkerDiedError(RuntimeError):
+    """A process of a collector has ended before the run."""
+
+
+class _Processes(WorkerCollector):
+    """Workers that are processes of this machine; when one dies, the run ends.
+
+    TorchRL waits for its answer for ever.
+    """
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        try:
+            yield from super().__iter__()
+        except Exception as error:
+            self._require_workers(error)
+            raise
+
+    def _tell_weights(self, policy: TensorDictModuleBase) -> None:
+        failures: list[Exception] = []
+
+        def tell() -> None:
+            try:
+                super(_Processes, self)._tell_weights(policy)
+            except Exception as error:
+                failures.append(error)
+
+        # Ends with the program where the answer never comes.
+        telling = Thread(target=tell, daemon=True)
+        telling.start()
+        while telling.is_alive():
+            telling.join(1.0)
+            self._require_workers()
+        if failures:
+            raise failures[0]
+
+    def _require_workers(self, cause: Exception | None = None) -> None:
+        for number, process in enumerate([] if self._running is None else self._running.procs):
+            with suppress(ValueError):  # of those that TorchRL has closed
+                if not process.is_alive():
+                    raise WorkerDiedError(
+                        f"collector: worker {number} ended with exit code {process.exitcode} "
+                        "before the run; an exit code of -9 often means that the memory was full. "
+                        "Take fewer collector.workers, or go on with cnfp-train resume=FOLDER"
+                    ) from cause
+
+
+class MultiSync(_Processes):
     """Batches of all workers together, all with the same weights."""
 
     def _start(
@@ -185,7 +232,7 @@ class MultiSync(WorkerCollector):
             )
 
 
-class MultiAsync(WorkerCollector):
+class MultiAsync(_Processes):
     """Batches of one worker at a time, which may have acted by the weights before the last."""
 
     def _start(

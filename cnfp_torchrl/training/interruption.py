@@ -63,6 +63,7 @@ class StopRequest:
         self._signals = signals
         self.signal: int | None = None
         """The number of the signal that came, or None."""
+        self._last_words: str | None = None
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -79,7 +80,27 @@ class StopRequest:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
+    @contextmanager
+    def ending_at_once(self, message: str) -> Iterator[None]:
+        """End by a signal at once, for work that begins anew when the run goes on.
+
+        Args:
+            message: sentence that says how to go on.
+
+        Raises:
+            TrainingInterrupted: when a signal comes, or has come before.
+        """
+        if self.signal is not None:
+            raise TrainingInterrupted(self.signal, message)
+        self._last_words = message
+        try:
+            yield
+        finally:
+            self._last_words = None
+
     def _remember(self, number: int, frame: FrameType | None) -> None:
+        if self._last_words is not None:
+            raise TrainingInterrupted(number, self._last_words)
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 from cnfp_torchrl.whole_file import whole_file
 
+EVALUATION = "evaluation/"
+"""The beginning of the names of what evaluations during training log."""
 
-def cut_logs(folder: Path, step: int) -> None:
+
+def cut_logs(folder: Path, step: int, evaluated_at: int) -> None:
     """Remove what TorchRL's CSV and TensorBoard loggers wrote after a step, and broken last lines.
 
     What is removed will be written anew, so that no row is missing and none is there twice.
@@ -16,19 +20,26 @@ def cut_logs(folder: Path, step: int) -> None:
     Args:
         folder: a run's folder, in whose subfolders the loggers write.
         step: the last one whose entries stay.
+        evaluated_at: the last one of which an evaluation stays: that of a run's end comes behind
+            the state of the same step.
     """
+
+    def last_step(name: str) -> int:
+        return evaluated_at if name.startswith(EVALUATION) else step
+
     for path in sorted(folder.glob("*/scalars/**/*.csv")):
+        last = last_step(path.as_posix().rpartition("/scalars/")[2])
         lines = path.read_bytes().splitlines(keepends=True)
-        kept = [line for line in lines if line.endswith(b"\n") and int(line.split(b",")[0]) <= step]
+        kept = [line for line in lines if line.endswith(b"\n") and int(line.split(b",")[0]) <= last]
         if kept != lines:
             with whole_file(path) as file:
                 file.writelines(kept)
     for path in sorted(folder.rglob("events.out.tfevents.*")):
-        _cut_events(path, step)
+        _cut_events(path, last_step)
 
 
-def _cut_events(path: Path, step: int) -> None:
-    """Write a file of TensorBoard's anew, without events after a step.
+def _cut_events(path: Path, last_step: Callable[[str], int]) -> None:
+    """Write a file of TensorBoard's anew, without events after the last step of their name.
 
     TensorBoard would hide them by itself if told where a run goes on, other readers would not.
     """
@@ -40,5 +51,6 @@ def _cut_events(path: Path, step: int) -> None:
     with whole_file(path) as file:
         writer = RecordWriter(file)
         for event in LegacyEventFileLoader(str(path)).Load():
-            if event.step <= step:
+            names = [value.tag for value in event.summary.value] or [""]
+            if event.step <= min(map(last_step, names)):
                 writer.write(event.SerializeToString())

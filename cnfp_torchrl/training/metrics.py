@@ -22,6 +22,7 @@ from cnfp_torchrl.training.constraint_counts import (
     ConstraintTally,
     violations_of,
 )
+from cnfp_torchrl.training.log_files import EVALUATION
 
 
 class Metrics:
@@ -94,7 +95,9 @@ class Metrics:
         self._next_log = state["next_log"]
         clocks = time.perf_counter(), time.process_time()
         self._started = [now - past for now, past in zip(clocks, state["seconds"], strict=True)]
-        self._before = {n: ConstraintCounts(**counts) for n, counts in state["before"].items()}
+        self._before = {
+            name: ConstraintCounts(**counts) for name, counts in state["before"].items()
+        }
         self._recent.load_state_dict(state["recent"])
         self._returns = list(state["returns"])
         self._losses.update({name: list(values) for name, values in state["losses"].items()})
@@ -124,12 +127,12 @@ class Metrics:
             report: its ``return_mean``, ``score`` and ``violations``.
         """
         self.finish()  # so that what is logged up to here is what a resumed run keeps
-        self._log("evaluation/return", report["return_mean"])
+        self._log(f"{EVALUATION}return", report["return_mean"])
         if report["score"] is not None:
-            self._log("evaluation/score", report["score"])
+            self._log(f"{EVALUATION}score", report["score"])
         for name, count in report["violations"].items():
             if count is not None:
-                self._log(f"evaluation/violations_{name}", count)
+                self._log(f"{EVALUATION}violations_{name}", count)
 
     def log_if_due(self) -> None:
         """Write an entry of the log when the interval has passed.

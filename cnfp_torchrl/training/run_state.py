@@ -66,8 +66,13 @@ class RunState:
         To be called before the loggers are made.
         """
         self._checkpoints.drop_after(self._saved_at)
-        logged_at = 0 if self._saved is None else self._saved["metrics"]["logged_at"]
-        cut_logs(self._folder.path, logged_at)
+        logged_at = evaluated_at = 0
+        if self._saved is not None:
+            logged_at = self._saved["metrics"]["logged_at"]
+            evaluated_at = max(
+                (e["step"] for e in self._saved["evaluations"]["history"]), default=0
+            )
+        cut_logs(self._folder.path, logged_at, evaluated_at)
 
     def restore(
         self, components: Mapping[str, Stateful], transitions: StoredTransitions | None

@@ -168,55 +168,54 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
                 stacklevel=3,
             )
 
-    with closing(callback), closing(evaluations):
-        with (
-            closing(metrics),
-            shutting_down(collector),
-            StopRequest(STOP_SIGNALS if is_saved else ()) as stop,
-        ):
-            for collected in collector:
-                callback.on_batch(collected)
-                metrics.add_steps(collected.reshape(-1))
-                for losses in learner.learn(collected, metrics.frames):
-                    metrics.add_losses(losses)
-                metrics.log_if_due()
-                is_last = metrics.frames >= config.collector.total_frames
-                if (report := evaluations.run_if_due(metrics.frames, is_last=False)) is not None:
-                    metrics.add_evaluation(report)
-                    best.offer_evaluation(report)
-                if is_last or stop.signal is not None or state.is_due(metrics.frames):
-                    if evaluation.interval is None:
-                        best.offer(*_training_score(metrics, score))
-                    state.save(metrics.frames)
-                if stop.signal is not None:
-                    raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
-            # Behind the last state, so that an extended run is as one that was longer at once.
-            if (report := evaluations.run_if_due(metrics.frames, is_last=True)) is not None:
-                metrics.add_evaluation(report)
-                best.offer_evaluation(report)
-            metrics.finish()
-        # Before anything else that may fail or be interrupted.
-        folder.save_checkpoint(**trained)
+    def evaluate_if_due(is_last: bool) -> None:
+        if (report := evaluations.run_if_due(metrics.frames, is_last)) is not None:
+            metrics.add_evaluation(report)
+            best.offer_evaluation(report)
 
-        # Evaluation
-        summary = {
-            **_results(metrics, _evaluations(config, actor, evaluation), score),
-            "evaluations_in_training": evaluations.history,
-            "steps": metrics.frames,
-            "seconds": metrics.seconds,
-            "flow": type(flow_head(actor).flow).__name__,
-            "order": flow_head(actor).order,
-            "seed": config.seed,
-            **provenance(config.device),
-        }
+    with closing(callback), closing(evaluations):
+        with StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+            with closing(metrics), shutting_down(collector):
+                for collected in collector:
+                    callback.on_batch(collected)
+                    metrics.add_steps(collected.reshape(-1))
+                    for losses in learner.learn(collected, metrics.frames):
+                        metrics.add_losses(losses)
+                    metrics.log_if_due()
+                    is_last = metrics.frames >= config.collector.total_frames
+                    evaluate_if_due(is_last=False)
+                    if is_last or stop.signal is not None or state.is_due(metrics.frames):
+                        if evaluation.interval is None:
+                            best.offer(*_training_score(metrics, score))
+                        state.save(metrics.frames)
+                    if stop.signal is not None:
+                        raise TrainingInterrupted(stop.signal, folder.how_to_resume(metrics.frames))
+                # Behind the last state, so that an extended run is as one that was longer at once.
+                evaluate_if_due(is_last=True)
+                metrics.finish()
+            # Before anything else that may fail or be interrupted.
+            folder.save_checkpoint(**trained)
+
+            # Evaluation
+            with stop.ending_at_once(folder.how_to_resume(metrics.frames)):
+                summary = {
+                    **_results(metrics, _evaluations(config, actor, evaluation), score),
+                    "evaluations_in_training": evaluations.history,
+                    "steps": metrics.frames,
+                    "seconds": metrics.seconds,
+                    "flow": type(flow_head(actor).flow).__name__,
+                    "order": flow_head(actor).order,
+                    "seed": config.seed,
+                    **provenance(config.device),
+                }
         folder.save_summary(summary)
         state.finish()
         # When the results are kept: a callback that fails takes nothing with it.
         if visual is not None:
             with closing(
                 build_environment(config, batch_size=[1], device=config.device, with_anchor=True)
-            ) as one:
-                give_episodes(callback, visual, evaluation, one, actor)
+            ) as single:
+                give_episodes(callback, visual, evaluation, single, actor)
     return summary
 
 

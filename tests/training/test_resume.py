@@ -163,6 +163,20 @@ def test_a_signal_stops_a_run_when_it_is_saved(
     assert not differences(whole, folder.path)
 
 
+def test_a_signal_ends_the_evaluation_at_once(
+    whole: Path, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder.create(tmp_path / "stopped")
+    evaluation = "cnfp_torchrl.training.train.evaluate_seeded"
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+        with pytest.raises(TrainingInterrupted, match=r"step 192; go on with: .*stopped"):
+            train(make_config(*TINY), folder)
+    assert not folder.is_finished
+    go_on(folder.path, make_config=make_config)
+    assert not differences(whole, folder.path)
+
+
 def test_a_second_signal_stops_at_once() -> None:
     with StopRequest() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -172,11 +186,9 @@ def test_a_second_signal_stops_at_once() -> None:
 
 
 def test_a_finished_run_can_be_extended(make_config: MakeConfig, tmp_path: Path) -> None:
-    # So that the last entry of the log is not one of the longer run's.
-    settings = [*TINY, "training.log_interval=80"]
     longer = "collector.total_frames=288"
-    train(make_config(*settings, longer), RunFolder.create(tmp_path / "whole"))
-    train(make_config(*settings), RunFolder.create(tmp_path / "extended"))
+    train(make_config(*TINY, longer), RunFolder.create(tmp_path / "whole"))
+    train(make_config(*TINY), RunFolder.create(tmp_path / "extended"))
     before = (tmp_path / "extended" / "summary.json").read_text()
     with pytest.raises(ValueError, match="finished with 192 steps"):
         go_on(tmp_path / "extended", make_config=make_config)
