@@ -14,7 +14,7 @@ NUMERIC := $(filter-out %/test_compile.py,$(wildcard tests/bijectors/test_*.py t
 	tests/test_distributions.py tests/modules/test_latent.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench bench-anchors bench-lines bench-updates paper figures docs check lint rooms types format clean
+.PHONY: help install train evaluate audit view explain test test-slow test-rounding bench bench-anchors bench-layers bench-lines bench-updates paper figures docs check lint rooms types format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s  %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,10 +48,13 @@ test-rounding: $(STAMP) ## Repeat the numeric tests with PyTorch's kernels for o
 bench: $(STAMP) ## Time the flows against TanhNormal and projections (some 15 minutes)
 	$(PY) experiments/benchmarks/flows.py $(ARGS)
 
-bench-anchors: $(STAMP) ## Time anchors beside the flow and qpax's projection (some 2 minutes)
+bench-anchors: $(STAMP) ## Time anchors beside the flow and qpax's projection (some 3 minutes)
 	$(PY) experiments/benchmarks/anchor_times.py $(ARGS)
 
-bench-lines: $(STAMP) ## Time steps, paths, flows and anchors, a line each (ARGS="--line NAME")
+bench-layers: $(STAMP) ## Time layers beside solvers, and count what each leaves broken (some 2 minutes)
+	$(PY) experiments/benchmarks/layers.py $(ARGS)
+
+bench-lines: $(STAMP) ## Time steps, paths and flows, a line each (ARGS="--line NAME")
 	$(PY) experiments/benchmarks/lines.py $(ARGS)
 
 bench-updates: $(STAMP) ## Time updates and training beside Stable-Baselines3 (some 10 minutes)

@@ -98,9 +98,9 @@ def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[
     """Go on with the runs that are neither done nor running; yield a line for each when it ends.
 
     Args:
-        folder: the sweep's folder.
-        jobs: number of runs at a time, each in a process of its own.
-        trusted: names that their configurations may use, as ``trusted`` of ``cnfp-train``.
+        folder: The sweep's folder.
+        jobs: The number of runs at a time, each in a process of its own.
+        trusted: The names that their configurations may use, as ``trusted`` of ``cnfp-train``.
     """
 
     def go_on(run: SweepRun) -> str:

@@ -40,9 +40,9 @@ def run_name(number: int, overrides: Sequence[str], constant: Sequence[str]) -> 
     """Return the name of a run's folder: its number and what was varied, such as ``3_seed-1``.
 
     Args:
-        number: the run's number in the sweep.
-        overrides: all overrides of the run.
-        constant: the keys that all runs have in common.
+        number: The run's number in the sweep.
+        overrides: All overrides of the run.
+        constant: The keys that all runs have in common.
     """
     varied = (override.lstrip("+~").partition("=") for override in overrides)
     parts = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,11 +14,14 @@ from cnfp_torchrl.commands.extras import needs_extra
 with needs_extra("rerun"):
     from cnfp_torchrl.visual.rerun.follow import Follower, Lost, NotStarted, is_being_written
     from cnfp_torchrl.visual.rerun.viewers import (
+        PORT,
+        WEB_PORT,
         RunningViewer,
         SinkError,
         Viewer,
         ViewerWindow,
         WebViewer,
+        free_port,
         has_display,
     )
 
@@ -62,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     target.add_argument("--connect", metavar="URL", help="show it in a viewer that runs already")
     parser.add_argument("--memory-limit", default="2GiB", help="of the viewer (%(default)s)")
     given = parser.parse_args(arguments)
+    # An exception, with which what was started for this command ends, too.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         path = newest_recording(given.run)
         viewer = _viewer(given)
@@ -81,7 +87,9 @@ def _viewer(given: argparse.Namespace) -> Viewer:
     if given.connect:
         return RunningViewer(given.connect)
     if given.web:
-        return WebViewer(memory_limit=given.memory_limit)
+        # Another viewer on the usual ports is no reason to refuse: the address is printed.
+        ports = free_port(WEB_PORT), free_port(PORT)
+        return WebViewer(*ports, memory_limit=given.memory_limit)
     if not has_display():
         raise SinkError(
             "expected a display to open a window on; serve the recording to a browser instead, "

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.envs.compiled_geometry import CompiledGeometry
+from cnfp_torchrl.envs.compiled_geometry import CompiledGeometry, anchor_entries
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform, are_good
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
 from cnfp_torchrl.geometry import LEEWAY, Begun, Box, GeometryError, begin_anchor, finish_anchor
@@ -113,33 +113,31 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         return list(self._bijectors)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        begun, decided = self._begun(next_tensordict)
         batch = next_tensordict.batch_size
-        if decided:
-            found = begun.all_held()
-            self._watch.all_held(batch.numel())
+        if self._compiled is not None:
+            begun, flags = self._compiled(next_tensordict)
         else:
+            begun = self._begun(next_tensordict)
+            flags = begun.attempt.decided.all().unsqueeze(0)
+        if self._settled(next_tensordict, flags):
+            self._watch.all_held(batch.numel())
+            if self._compiled is not None:
+                return next_tensordict  # it has published that all sets hold
+            found = begun.all_held()
+        else:
+            if self._compiled is not None:
+                begun = begun._replace(sets=self._compiled.sets(next_tensordict))
             found = finish_anchor(begun, self._leeway)
             if self._watch.looks and bool(found.active.all()):
                 self._watch.all_held(batch.numel())
             else:
                 self._watch(begun.sets, found.largest(), batch.numel())
-        next_tensordict.set(ANCHOR_KEY, _expanded(found.anchor, batch))
-        active = _expanded(found.active, batch).unbind(-1)
-        for stage, bijector in enumerate(self._bijectors, start=1):
-            rows = _expanded(found.relaxation[stage], batch)
-            largest = rows.squeeze(-1) if rows.shape[-1] == 1 else rows.amax(-1)
-            next_tensordict.set(bijector.active_key, active[stage])
-            next_tensordict.set(bijector.relaxation_key, largest)
-            if bijector.row_relaxation_key is not None:
-                next_tensordict.set(bijector.row_relaxation_key, rows)
+        for key, value in anchor_entries(found, self._bijectors, batch).items():
+            next_tensordict.set(key, value)
         return next_tensordict
 
-    def _begun(self, next_tensordict: TensorDictBase) -> tuple[Begun, bool]:
-        """Begin to look for anchors, settle all checks, and tell whether all are found."""
-        if self._compiled is not None:
-            begun, flags = self._compiled(next_tensordict)
-            return begun, self._settled(next_tensordict, flags)
+    def _begun(self, next_tensordict: TensorDictBase) -> Begun:
+        """Begin to look for anchors by the sets in a tensordict."""
         bounds = self._action_bounds()
         # In the dtype of the actions, as the flow will see them.
         sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
@@ -152,8 +150,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
         if candidate is not None:
             candidate = candidate.to(bounds.dtype)
-        begun = begin_anchor([bounds, *sets], candidate)
-        return begun, self._settled(next_tensordict, begun.attempt.decided.all().unsqueeze(0))
+        return begin_anchor([bounds, *sets], candidate)
 
     def _settled(self, states: TensorDictBase, flags: Tensor) -> bool:
         """Settle the checks of all geometries, and tell whether all states are decided.
@@ -284,8 +281,3 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             bounds = action_bounds(self.parent.full_action_spec, self.parent.action_key)
             self._bounds = ActionBounds(bounds)
         return self._bounds.on(device)
-
-
-def _expanded(value: Tensor, batch: torch.Size) -> Tensor:
-    """Return values ``(..., m)`` as ``(*batch, m)``."""
-    return value if value.shape[:-1] == batch else value.expand(*batch, value.shape[-1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -56,7 +57,9 @@ def can_render(env: EnvBase | None) -> bool:
 
 
 def _renders(layer: object) -> bool:
-    return callable(getattr(type(layer), "render", None))
+    # Every environment of Gymnasium has the method, of which that of the base class only raises.
+    render = getattr(type(layer), "render", None)
+    return callable(render) and render is not gymnasium.Env.render
 
 
 def _render(renderer: Any) -> Tensor | None:

@@ -216,10 +216,18 @@ class ShowTask(Transform):
 
     Args:
         view: The view.
+
+    Raises:
+        TypeError: for anything that is no `TaskView`.
     """
 
     def __init__(self, view: TaskView) -> None:
         super().__init__()
+        if not isinstance(view, TaskView):
+            raise TypeError(
+                "env.view: expected an instance of a class derived from "
+                f"cnfp_torchrl.envs.TaskView, given {view!r}"
+            )
         self.view = view
 
     def _reset(

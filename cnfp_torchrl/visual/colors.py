@@ -23,7 +23,7 @@ def constraint_colors(names: Iterable[str]) -> dict[str, str]:
     the same colors. From nine names on, colors repeat.
 
     Args:
-        names: of all constraints, in any order.
+        names: The names of all constraints, in any order.
     """
     given = list(dict.fromkeys(names))
     numbered = {name: _CONSTRAINTS[i % len(_CONSTRAINTS)] for i, name in enumerate(sorted(given))}

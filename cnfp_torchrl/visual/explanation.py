@@ -35,19 +35,21 @@ class ConstraintEffect:
     """What one constraint did in one step.
 
     Args:
-        name: of the constraint.
-        effect: ``permissive``, it changed no sample; ``restrictive``, it changed some; ``relaxed``,
-            it cannot hold as stated and its set is widened; ``dropped``, it cannot hold here;
-            ``broken``, the executed action lies outside its set.
-        before: the executed action before its stage, None where it has none or the way is unknown.
-        after: the executed action after its stage, or None.
-        moved: by how much its stage moved the executed action, in action units, or None.
-        share_moved: of the samples, how many its stage moved; None where it moves all of them.
-        share_outside: of the samples, how many lie outside its set in the end.
-        share_allowed: of the action bounds, how much its set allows; None in many dimensions.
-        relaxation: by how much its set is widened; 0 where it holds, infinite where it is dropped.
-        slack: of the executed action in its set: inside by so much, outside where negative.
-        sentence: what the task says about it in this state, or None.
+        name: The name of the constraint.
+        effect: The effect: ``permissive``, it changed no sample; ``restrictive``, it changed some;
+            ``relaxed``, it cannot hold as stated and its set is widened; ``dropped``, it cannot
+            hold here; ``broken``, the executed action lies outside its set.
+        before: The executed action before its stage, None where it has none or the way is unknown.
+        after: The executed action after its stage, or None.
+        moved: The amount by which its stage moved the executed action, in action units, or None.
+        share_moved: The share of the samples that its stage moved; None where it moves all of them.
+        share_outside: The share of the samples that lie outside its set in the end.
+        share_allowed: The share of the action bounds that its set allows; None in many dimensions.
+        relaxation: The amount by which its set is widened; 0 where it holds, infinite where it is
+            dropped.
+        slack: The slack of the executed action in its set: inside by so much, outside where
+            negative.
+        sentence: The task's sentence about it in this state, or None.
     """
 
     name: str
@@ -68,17 +70,19 @@ class Explanation:
     """What a flow policy did in one step; `markdown` and `text` put it into sentences.
 
     Args:
-        action: the executed one.
-        latent: the sample of the Gaussian base that it came from; None where that is unknown.
-        bounded: the action after the action bounds alone, None where the flow has no such stage.
-        constraints: their effects in order of application, the last one with the highest priority.
-        share_allowed: of the action bounds, how much all of them allow; None in many dimensions.
-        share_allowed_before: of the policy's samples, how many the constraints that hold would
+        action: The executed action.
+        latent: The sample of the Gaussian base that it came from; None where that is unknown.
+        bounded: The action after the action bounds alone, None where the flow has no such stage.
+        constraints: The constraints' effects in order of application, the last one with the highest
+            priority.
+        share_allowed: The share of the action bounds that all of them allow; None in many
+            dimensions.
+        share_allowed_before: The share of the policy's samples that the constraints that hold would
             allow without the flow.
-        samples: how many samples the shares are of.
-        situation: the environment's state in a sentence, or None.
-        is_safe: whether the flow keeps every constraint that it does not drop.
-        components: names and units of the action's components.
+        samples: The number of samples that the shares are of.
+        situation: The environment's state in a sentence, or None.
+        is_safe: Whether the flow keeps every constraint that it does not drop.
+        components: The names and units of the action's components.
     """
 
     action: Vector
@@ -216,9 +220,9 @@ def explain(
     """Explain what a flow policy did in one step.
 
     Args:
-        snapshot: of the step; the followed sample is the executed one.
-        view: says what the task knows about the state, in sentences.
-        components: names and units of the action's components; none numbers them.
+        snapshot: The snapshot of the step; the followed sample is the executed one.
+        view: The task's view, which says what it knows about the state, in sentences.
+        components: The names and units of the action's components; none numbers them.
     """
     sentences = view.constraint_sentences(snapshot.state)
     stages = {stage.applied[-1]: i for i, stage in enumerate(snapshot.stages)}
@@ -302,7 +306,7 @@ def _allowed(snapshot: FlowSnapshot) -> Tensor:
     """Tell which of many actions, spread evenly over the bounds, each set allows, ``(K, n)``."""
     bounds = snapshot.region.bounds
     spread = bounds.low + (bounds.high - bounds.low) * _evenly_spread(snapshot.dim).to(bounds.low)
-    allowed = [each.contains(spread) for each in snapshot.region.sets[1:]]
+    allowed = [constraint.contains(spread) for constraint in snapshot.region.sets[1:]]
     return torch.stack(allowed) if allowed else torch.ones(0, _DRAWS, dtype=torch.bool)
 
 

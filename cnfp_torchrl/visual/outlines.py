@@ -31,11 +31,12 @@ class Outlines:
     or the shadow that the set casts on the plane.
 
     Args:
-        region: of one state, best in float64.
-        components: one or two components of the action.
-        rays: at equal angles; the corners of boxes have rays of their own.
-        shadows: take shadows, not sections; slow, and shadows of single sets are those of the part
-            within the action bounds, because that of a half-space alone would not show it.
+        region: The region of one state, best in float64.
+        components: One or two components of the action.
+        rays: The number of rays at equal angles; the corners of boxes have rays of their own.
+        shadows: Whether shadows are taken, and not sections; slow, and shadows of single sets are
+            those of the part within the action bounds, because that of a half-space alone would not
+            show it.
     """
 
     def __init__(
@@ -55,8 +56,8 @@ class Outlines:
         self._region = region
         self._holds = region.is_active.tolist()
         self._gauges: list[NDArray[np.float64] | None] = [
-            each.gauge(self._direction, region.anchor).numpy() if self.holds(k) else None
-            for k, each in enumerate(region.sets)
+            constraint.gauge(self._direction, region.anchor).numpy() if self.holds(k) else None
+            for k, constraint in enumerate(region.sets)
         ]
         self._boundaries: dict[tuple[int, ...], Line] = {}
 
@@ -93,7 +94,7 @@ class Outlines:
 
         def gauge(rest: Tensor) -> Tensor:
             direction = self._direction.index_copy(-1, torch.tensor(self._hidden), rest)
-            return torch.stack([each.gauge(direction, anchor) for each in sets]).amax(0)
+            return torch.stack([constraint.gauge(direction, anchor) for constraint in sets]).amax(0)
 
         best = gauge(rest)
         with torch.enable_grad():
@@ -111,22 +112,22 @@ class Outlines:
         return found
 
 
-def set_outline(each: ConstraintSet, view: View, nodes: int = 400) -> list[Line]:
+def set_outline(allowed: ConstraintSet, view: View, nodes: int = 400) -> list[Line]:
     """Return the boundary of a set of actions in the plane, where its slack is zero.
 
     Works wherever the set lies, also for one that was dropped and has no point in common with the
     region.
 
     Args:
-        each: one set, of batch shape ``()`` and dimension 2.
-        view: outside of it nothing is drawn.
-        nodes: of the grid along each axis.
+        allowed: The set, of batch shape ``()`` and dimension 2.
+        view: The view, outside of which nothing is drawn.
+        nodes: The number of nodes of the grid along each axis.
     """
     x_low, x_high, y_low, y_high = view
     x = torch.linspace(x_low, x_high, nodes, dtype=torch.float64)
     y = torch.linspace(y_low, y_high, nodes, dtype=torch.float64)
     actions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    slack = each.to(torch.float64).slack(actions)
+    slack = allowed.to(torch.float64).slack(actions)
     # A slack may be infinite; a contour needs numbers on both sides of it.
     slack = slack.nan_to_num(nan=-1e6, posinf=1e6, neginf=-1e6)
     contours = contourpy.contour_generator(x.numpy(), y.numpy(), slack.numpy())
@@ -139,8 +140,8 @@ def region_outline(region: Region, applied: Sequence[int]) -> Line:
     In more than two dimensions it is the boundary of the shadow on the first two components.
 
     Args:
-        region: of batch shape ``()`` and dimension 2 or more.
-        applied: indices into its sets; those that are not active are left out.
+        region: A region of batch shape ``()`` and dimension 2 or more.
+        applied: The indices into its sets; those that are not active are left out.
     """
     return Outlines(region.to(torch.float64), (0, 1), rays=1440, shadows=True).of_intersection(
         applied
@@ -213,9 +214,9 @@ def _rays(anchor: Line, corners: Line, count: int) -> Line:
 def _corners(region: Region, chosen: list[int]) -> Line:
     """Return the corners of boxes, which rays at equal angles would cut off, ``(corners, m)``."""
     ends = [
-        (each.low.numpy()[chosen], each.high.numpy()[chosen])
-        for each in region.sets
-        if isinstance(each, Box) and len(chosen) == 2
+        (box.low.numpy()[chosen], box.high.numpy()[chosen])
+        for box in region.sets
+        if isinstance(box, Box) and len(chosen) == 2
     ]
     corners = [(x, y) for low, high in ends for x in (low[0], high[0]) for y in (low[1], high[1])]
     found = np.array(corners).reshape(-1, len(chosen))

@@ -28,9 +28,9 @@ def replay_step(
     last stage stands the recorded action, bit by bit.
 
     Args:
-        actor: from `make_constrained_actor` or `constrain`.
-        transition: of batch size ``()``, with geometry and action; not changed.
-        noise: standard Gaussian, ``(n, d)``, for the other samples.
+        actor: A constrained actor, from `make_constrained_actor` or `constrain`.
+        transition: A transition of batch size ``()``, with geometry and action; not changed.
+        noise: Noise of the standard Gaussian, ``(n, d)``, for the other samples.
 
     Raises:
         ValueError: when the transition is a batch.
@@ -56,7 +56,8 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     region = snapshot.region.to(torch.float64)
     staged = StagedFlow(snapshot.head.flow, region, [stage.applied for stage in snapshot.stages])
     given = action.double()
-    latent, inverse_log_det = (each[-1] for each in staged.inverse(given[None]))
+    latents, inverse_log_dets = staged.inverse(given[None])
+    latent, inverse_log_det = latents[-1], inverse_log_dets[-1]
     path, log_dets = staged.forward(latent)
     path = path.squeeze(1)
     if isinstance(staged.last, SquashChain):
@@ -72,7 +73,7 @@ def _with_executed(snapshot: FlowSnapshot, action: Tensor) -> FlowSnapshot:
     of_action = (latent_log_density - log_dets).masked_fill(
         ~has_latent(latent, inverse_log_det), -torch.inf
     )
-    log_density = _before(of_action, torch.stack([each.log_density for each in snapshot.stages]))
+    log_density = _before(of_action, torch.stack([stage.log_density for stage in snapshot.stages]))
     stages = tuple(
         replace(stage, samples=samples[i], log_density=log_density[i])
         for i, stage in enumerate(snapshot.stages)

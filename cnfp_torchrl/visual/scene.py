@@ -35,10 +35,12 @@ class Detail:
     """How fine a scene is computed.
 
     Args:
-        cells: of the density's grid along each axis, and a quarter of those in one dimension.
-        rays: of outlines.
-        nodes: along each axis of the grid that outlines of dropped sets are traced on.
-        shadows: in more than two dimensions, draw the shadows of sets and not sections; slow.
+        cells: The number of cells of the density's grid along each of two axes; four times as many
+            in one dimension.
+        rays: The number of rays of outlines.
+        nodes: The number of nodes along each axis of the grid that dropped sets are traced on.
+        shadows: Whether the shadows of sets are drawn in more than two dimensions, and not
+            sections; slow.
     """
 
     cells: int = 40
@@ -54,13 +56,13 @@ class SetsOnMap(NamedTuple):
     """Where the agent stands and where the allowed actions would lead it.
 
     Args:
-        position: of the agent, ``(2,)``.
-        goal: where it has to go, ``(2,)``, or None.
-        sets: the boundary of each constraint's set, none of dropped ones.
-        dropped: the boundary of each dropped constraint's set, none of the others.
-        allowed: the boundary of the allowed moves.
-        targets: where the samples lead, ``(n, 2)``.
-        move: of the followed action, ``(2,)``.
+        position: The position of the agent, ``(2,)``.
+        goal: The goal, where it has to go, ``(2,)``, or None.
+        sets: The boundary of each constraint's set, none of dropped ones.
+        dropped: The boundary of each dropped constraint's set, none of the others.
+        allowed: The boundary of the allowed moves.
+        targets: The points that the samples lead to, ``(n, 2)``.
+        move: The move of the followed action, ``(2,)``.
     """
 
     position: NDArray[np.float64]
@@ -76,10 +78,10 @@ class Scene:
     """One step of a flow policy, as arrays, each computed when it is first asked for.
 
     Args:
-        setting: that of all steps.
-        snapshot: what happened; the followed sample is the executed action.
-        detail: how fine.
-        actions: the grid of `Setting.grid`; None makes it anew.
+        setting: The setting of all steps.
+        snapshot: The snapshot, of which the followed sample is the executed action.
+        detail: The fineness of what is drawn.
+        actions: The grid of `Setting.grid`; None makes it anew.
     """
 
     def __init__(
@@ -109,7 +111,7 @@ class Scene:
     @property
     def moved(self) -> Mapping[str, float | None]:
         """By how much each constraint moved the executed action, None where that is unknown."""
-        return {each.name: each.moved for each in self.explanation.constraints}
+        return {effect.name: effect.moved for effect in self.explanation.constraints}
 
     def samples(self, stage: int, components: Sequence[int]) -> Floats:
         """Return components of all samples after a stage, ``(n, m)``."""
@@ -195,13 +197,13 @@ class Scene:
         assert self.log_density is not None
         values = self.log_density.numpy()
         heights = np.exp(np.minimum(values - _top(values), 0.0))
-        return [np.stack([self.actions[:, 0].numpy(), each], axis=-1) for each in heights]
+        return [np.stack([self.actions[:, 0].numpy(), curve], axis=-1) for curve in heights]
 
     def on_map(self, targets: int) -> SetsOnMap | None:
-        """Return the sets of actions in place, with some samples; None without a map.
+        """Return the sets and some samples at the agent's position; None for a task without a map.
 
         Args:
-            targets: number of samples.
+            targets: The number of samples.
         """
         view, samples = self.setting.view, self.snapshot.stages[-1].samples
         plane = view.map
@@ -209,7 +211,7 @@ class Scene:
             return None
         state = self.snapshot.state
         position = view.position(state).tolist()
-        place, goal = np.array(position), view.goal(state)
+        origin, goal = np.array(position), view.goal(state)
         sets: list[list[Line]] = []
         dropped: list[list[Line]] = []
         allowed: list[Line] = []
@@ -217,25 +219,25 @@ class Scene:
         if plane.step_length is not None and self.setting.dim == 2:
             step, limits = plane.step_length, _reachable(plane, position, plane.step_length)
             seen = self._seen((0, 1))
-            for k, each in enumerate(self.snapshot.region.sets[1:], start=1):
+            for k, constraint in enumerate(self.snapshot.region.sets[1:], start=1):
                 boundary = seen.of_set(k)
                 inside = [] if boundary is None else within(boundary, limits)
                 traced = []
                 if boundary is None:
-                    traced = set_outline(each, limits, self.detail.nodes)
-                sets.append([place + step * line for line in inside])
-                dropped.append([place + step * line for line in traced])
+                    traced = set_outline(constraint, limits, self.detail.nodes)
+                sets.append([origin + step * line for line in inside])
+                dropped.append([origin + step * line for line in traced])
             whole = seen.of_intersection(range(len(self.snapshot.region.sets)))
-            allowed = [place + step * line for line in within(whole, limits)]
+            allowed = [origin + step * line for line in within(whole, limits)]
             moves = step * samples.numpy()
         executed = moves[self.snapshot.followed] if len(moves) else np.zeros(2, dtype=np.float32)
         return SetsOnMap(
-            place,
+            origin,
             None if goal is None else goal.tolist(),
             sets,
             dropped,
             allowed,
-            place + moves[1 : 1 + targets],
+            origin + moves[1 : 1 + targets],
             executed,
         )
 
@@ -268,9 +270,9 @@ def base_density(snapshot: FlowSnapshot, spread: float, cells: int) -> tuple[Ten
     """Return a grid of latents around the Gaussian's mean, and its log-density there.
 
     Args:
-        snapshot: of one or two dimensions.
-        spread: how far the grid goes, in standard deviations.
-        cells: along each axis.
+        snapshot: A snapshot of one or two dimensions.
+        spread: The reach of the grid, in standard deviations.
+        cells: The number of cells along each axis.
 
     Returns:
         Latents ``(cells, 1)`` or ``(cells, cells, 2)``, and log-densities without the last axis.

@@ -36,9 +36,9 @@ class StageView(NamedTuple):
     """One view of one stage.
 
     Args:
-        stage: index of the stage.
-        components: of the action that the view shows, one or two, counted from 0.
-        title: of the view.
+        stage: The index of the stage.
+        components: The components of the action that the view shows, one or two, counted from 0.
+        title: The title of the view.
     """
 
     stage: int
@@ -51,19 +51,19 @@ class Setting:
     """What the scenes of a flow policy have in common.
 
     Args:
-        stages: names of the flow's stages in order of application.
-        constraints: names of the constraints in order of application.
-        low: lower action bounds.
-        high: upper action bounds.
-        projections: pairs of components, one row of views for each; none in one dimension.
-        view: what the task shows of itself.
-        components: names and units of the action's components.
-        observation: names and units of the components of ``observation``; none where there are too
-            many to show.
-        costs: names of the columns of ``cost``; none where the environment counts nothing.
-        moves: whether it is known how far each constraint moves an action.
-        reach: how far views extend, in half widths of the action bounds.
-        leaves_bounds: whether there can be actions outside the bounds before the last stage.
+        stages: The names of the flow's stages in order of application.
+        constraints: The names of the constraints in order of application.
+        low: The lower action bounds.
+        high: The upper action bounds.
+        projections: Pairs of components, one row of views for each; none in one dimension.
+        view: The view: what the task shows of itself.
+        components: The names and units of the action's components.
+        observation: The names and units of the components of ``observation``; none where there are
+            too many to show.
+        costs: The names of the columns of ``cost``; none where the environment counts nothing.
+        moves: Whether it is known how far each constraint moves an action.
+        reach: The reach of views, in half widths of the action bounds.
+        leaves_bounds: Whether there can be actions outside the bounds before the last stage.
     """
 
     stages: tuple[str, ...]
@@ -89,9 +89,10 @@ class Setting:
         """Return the setting of a policy.
 
         Args:
-            head: its flow module.
-            env: shows its task and says what the costs are called; None: neither.
-            projections: pairs of action components, each a row of views; None shows each component
+            head: The policy's flow module.
+            env: The environment, which shows its task and says what the costs are called; None:
+                neither.
+            projections: Pairs of action components, each a row of views; None shows each component
                 once.
 
         Raises:

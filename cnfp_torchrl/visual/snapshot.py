@@ -27,12 +27,13 @@ class Stage:
     """What one stage of a flow made of the base samples.
 
     Args:
-        name: of the constraint, or ``bounds``.
-        samples: ``(n, d)``.
-        log_density: of those samples in the distribution after this stage, ``(n,)``.
-        applied: indices into the region's sets of those applied so far, this one last.
-        relaxation: by how much the constraint's set had to be widened to hold in this state;
-            infinite for one that is dropped and changes nothing.
+        name: The name of the constraint, or ``bounds``.
+        samples: The samples, ``(n, d)``.
+        log_density: The log-density of those samples in the distribution after this stage,
+            ``(n,)``.
+        applied: The indices into the region's sets of those applied so far, this one last.
+        relaxation: The amount by which the constraint's set had to be widened to hold in this
+            state; infinite for one that is dropped and changes nothing.
     """
 
     name: str
@@ -54,22 +55,22 @@ class FlowSnapshot:
     The first sample is the executed one, and its path is followed unless another is chosen.
 
     Args:
-        state: the state, as the actor saw it, of batch size ``()``.
-        loc: of the Gaussian base, ``(d,)``.
-        scale: of the Gaussian base, ``(d,)``.
-        latents: base samples, ``(n, d)``.
-        latent_log_density: ``(n,)``.
-        stages: in order of application.
-        region: sets as they are applied in this state, widened where they are relaxed
+        state: The state, as the actor saw it, of batch size ``()``.
+        loc: The location of the Gaussian base, ``(d,)``.
+        scale: The scale of the Gaussian base, ``(d,)``.
+        latents: The base samples, ``(n, d)``.
+        latent_log_density: The log-density of the base samples, ``(n,)``.
+        stages: The stages in order of application.
+        region: The sets as they are applied in this state, widened where they are relaxed
             (``sets[0]`` the action bounds), anchor, and which sets are not dropped.
-        relaxation: by how much each of its sets is widened; infinite where it is dropped.
-        through_stages: maps further latents ``(n, d)`` to actions ``(stages, n, d)`` and
+        relaxation: The amount by which each of its sets is widened; infinite where it is dropped.
+        through_stages: A map of further latents ``(n, d)`` to actions ``(stages, n, d)`` and
             log-densities ``(stages, n)``.
-        log_densities: of further actions ``(n, d)`` after each stage, ``(stages, n)``; -inf where
-            there is none.
-        head: the policy's flow module.
-        followed: index of the sample whose path through the stages is drawn.
-        is_recovered: whether the path of an executed action is known; an action outside the flow's
+        log_densities: The log-densities of further actions ``(n, d)`` after each stage, ``(stages,
+            n)``; -inf where there is none.
+        head: The policy's flow module.
+        followed: The index of the sample whose path through the stages is drawn.
+        is_recovered: Whether the path of an executed action is known; an action outside the flow's
             support, which another policy may have taken, has none and seems to stand still.
     """
 
@@ -115,7 +116,7 @@ class FlowSnapshot:
     def contained(self) -> Tensor:
         """Which samples of the last stage each set contains, dropped ones too, ``(K + 1, n)``."""
         samples = self.stages[-1].samples
-        return torch.stack([each.contains(samples) for each in self.region.sets])
+        return torch.stack([allowed.contains(samples) for allowed in self.region.sets])
 
     @cached_property
     def share_allowed_before(self) -> float:
@@ -181,10 +182,10 @@ def take_snapshot(
     """Return what a constrained actor does in one state.
 
     Args:
-        actor: from `make_constrained_actor` or `constrain`.
-        state: of batch size ``()``, with geometry, anchor and active flags; not changed.
-        samples: how many base samples to draw.
-        seed: of those; torch's global generator is left alone.
+        actor: A constrained actor, from `make_constrained_actor` or `constrain`.
+        state: A state of batch size ``()``, with geometry, anchor and active flags; not changed.
+        samples: The number of base samples.
+        seed: The seed of those; torch's global generator is left alone.
 
     Raises:
         ValueError: when the state is a batch.
@@ -207,10 +208,10 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
     """Return the snapshot of a state in which a policy has written its Gaussian.
 
     Args:
-        head: the flow module of the policy.
-        state: of batch size ``()``, with location, scale and geometry; where anchor and active
-            flags are missing, which only exact flows need, they are computed here.
-        noise: standard Gaussian, ``(n, d)``.
+        head: The flow module of the policy.
+        state: A state of batch size ``()``, with location, scale and geometry; where anchor and
+            active flags are missing, which only exact flows need, they are computed here.
+        noise: Noise of the standard Gaussian, ``(n, d)``.
     """
     loc, scale = (state.get(key) for key in head.parameter_keys)
     base = Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
@@ -232,7 +233,7 @@ def snapshot_of(head: ConstrainedFlowModule, state: TensorDictBase, noise: Tenso
 
     latents = loc + scale * noise.to(loc)
     latent_log_density = base.log_prob(latents).cpu()
-    actions, log_dets = (each.cpu() for each in staged.forward(latents))
+    actions, log_dets = (values.cpu() for values in staged.forward(latents))
     on_host = region.to(device="cpu")
     stages = tuple(
         Stage(
@@ -269,7 +270,9 @@ def _as_applied(
     if state.get(ANCHOR_KEY, None) is not None:
         region = head.get_region(state)
     else:
-        region = Region.build([head.bounds, *(each.get_set(state) for each in head.bijectors)])
+        region = Region.build(
+            [head.bounds, *(bijector.get_set(state) for bijector in head.bijectors)]
+        )
     active = [True] * len(region.sets) if region.active is None else region.active.tolist()
     sets, relaxation = list(region.sets), [0.0 if flag else torch.inf for flag in active]
     if head.flow.is_safe and region.relaxation is not None:
@@ -290,9 +293,9 @@ class StagedFlow:
     """The bijectors of a flow up to each of its stages.
 
     Args:
-        flow: how the sets are combined.
-        region: of one state.
-        applied: for each stage, indices into the region's sets of those applied so far.
+        flow: The way in which the sets are combined.
+        region: The region of one state.
+        applied: The indices, for each stage, into the region's sets of those applied so far.
     """
 
     def __init__(self, flow: Flow, region: Region, applied: Sequence[Sequence[int]]) -> None:
@@ -302,13 +305,13 @@ class StagedFlow:
         if self._is_one:
             # To an exact flow, a set not yet applied is one that is not active.
             holds = torch.tensor(
-                [[k in each for k in range(len(region.sets))] for each in applied],
+                [[k in so_far for k in range(len(region.sets))] for so_far in applied],
                 device=region.anchor.device,
             )
             active = holds if region.active is None else holds & region.active
             self._bijectors = [flow(Region(region.sets, region.anchor, active.unsqueeze(1)))]
         else:
-            self._bijectors = [stage_bijector(flow, region, each) for each in applied]
+            self._bijectors = [stage_bijector(flow, region, so_far) for so_far in applied]
 
     @property
     def last(self) -> Bijector:
@@ -328,7 +331,7 @@ class StagedFlow:
         """
         if self._is_one:
             return self._each_stage(*self.last.inverse_and_log_det(actions))
-        found = [each.inverse_and_log_det(actions) for each in self._bijectors]
+        found = [bijector.inverse_and_log_det(actions) for bijector in self._bijectors]
         latents, log_dets = zip(*found, strict=True)
         return torch.stack(latents), torch.stack(log_dets)
 
@@ -342,9 +345,9 @@ def stage_bijector(flow: Flow, region: Region, applied: Sequence[int]) -> Biject
     """Return the bijector of a flow up to a stage.
 
     Args:
-        flow: how the sets are combined.
-        region: of one state.
-        applied: indices into the region's sets of those applied so far.
+        flow: The way in which the sets are combined.
+        region: The region of one state.
+        applied: The indices into the region's sets of those applied so far.
     """
     chosen = [0, *(k for k in applied if k > 0)]
     active = None if region.active is None else region.active[..., chosen]

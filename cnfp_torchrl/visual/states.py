@@ -32,10 +32,10 @@ def telling_states(
     is stepped at random, within the constraints.
 
     Args:
-        env: with geometry, anchor and active flags; it is reset. A larger batch looks at more
-            states.
-        head: the flow module of an actor for it.
-        steps: length of the random walk.
+        env: The environment, with geometry, anchor and active flags; it is reset. A larger batch
+            looks at more states.
+        head: The flow module of an actor for it.
+        steps: The length of the random walk.
     """
     candidates = find_task_view(env).candidate_states(env)
     if candidates is None:
@@ -58,7 +58,7 @@ def openness(region: Region) -> tuple[Tensor, Tensor]:
     Both are means over directions from the anchor, so that they make sense in any dimension.
 
     Args:
-        region: of batch shape ``(n,)``.
+        region: A region of batch shape ``(n,)``.
 
     Returns:
         The share of the way to the action bounds that is open, in (0, 1], ``(n,)``, and the share
@@ -68,7 +68,7 @@ def openness(region: Region) -> tuple[Tensor, Tensor]:
     ray = torch.randn(_DIRECTIONS, 1, region.anchor.shape[-1], generator=generator)
     ray = ray.to(region.anchor)
     gauges = torch.stack(
-        torch.broadcast_tensors(*(each.gauge(ray, region.anchor) for each in region.sets))
+        torch.broadcast_tensors(*(allowed.gauge(ray, region.anchor) for allowed in region.sets))
     )
     gauges = torch.where(region.is_active.movedim(-1, 0).unsqueeze(1), gauges, 0.0)
     outer, inner = gauges[0], gauges.amax(0)

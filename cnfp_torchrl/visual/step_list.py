@@ -26,12 +26,14 @@ class StepRecord:
     """What the constraints did in one step.
 
     Args:
-        number: of the step in its episode, from 0.
-        reward: of the step.
-        moved: how far each constraint moved the action; none where the flow does not tell.
-        allowed_before: the share of the policy's samples that would be allowed without the flow.
-        relaxation: by how much constraints are relaxed, of those that are; infinite where dropped.
-        violations: the constraints that the environment counts a violation of.
+        number: The number of the step in its episode, from 0.
+        reward: The reward of the step.
+        moved: The distances by which constraints moved the action; none where the flow does not
+            tell.
+        allowed_before: The share of the policy's samples that would be allowed without the flow.
+        relaxation: The amount by which constraints are relaxed, of those that are; infinite where
+            dropped.
+        violations: The constraints that the environment counts a violation of.
     """
 
     number: int
@@ -50,9 +52,9 @@ def step_records(
     """Return a record of each step of an episode.
 
     Args:
-        actor: from `make_constrained_actor` or `constrain`.
-        episode: transitions of batch size ``()``.
-        judged: the names of the columns of ``cost``.
+        actor: A constrained actor, from `make_constrained_actor` or `constrain`.
+        episode: The transitions, of batch size ``()``.
+        judged: The names of the columns of ``cost``.
     """
     dim = flow_head(actor).action_dim
     noise = torch.randn(_SAMPLES, dim, generator=torch.Generator().manual_seed(0))
@@ -127,9 +129,9 @@ def record_table(
     """Return records as a text table.
 
     Args:
-        records: of some steps.
-        reasons: why each one is worth a look; none leaves the column out.
-        unit: of the distances between actions.
+        records: The records of some steps.
+        reasons: The reasons why each one is worth a look; none leaves the column out.
+        unit: The unit of the distances between actions.
     """
     moved = list(dict.fromkeys(name for record in records for name in record.moved))
     relaxed = list(dict.fromkeys(name for record in records for name in record.relaxation))

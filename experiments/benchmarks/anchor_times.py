@@ -1,13 +1,14 @@
 """Time `lexicographic_anchor` beside the flow that uses its anchors, and beside qpax.
 
-    python experiments/benchmarks/anchor_times.py [--quick] [--before FILE] [--output FOLDER]
+    python experiments/benchmarks/anchor_times.py [--quick] [--rounds 7] [--out FOLDER]
 
 How the time grows with the batch, the dimension d and the number K of constraints, in states that
-are roomy or tight, and with the share of states in which a constraint must give way. The flow draws
-actions with their log-densities; qpax (`pip install 'cnfp_torchrl[bench]'`) projects one action of
-each state onto the same bounds and rows, of which there all can hold. In a round all take turns;
-processor time counts, which other programs hardly change. `--before` takes an ``anchors.json`` that
-this script wrote beside an older library.
+are roomy or tight, and with the share of states in which a constraint must give way: of balls,
+boxes and half-spaces that lie apart (`lines.problem`), and of rows that face each other
+(`facing_rows`), which is harder. The flow draws actions with their log-densities; qpax
+(`pip install 'cnfp_torchrl[bench]'`) projects one action of each state onto the same bounds and
+rows, of which there all can hold. In a round all take turns; processor time counts, which other
+programs hardly change.
 """
 
 from __future__ import annotations
@@ -17,32 +18,33 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
-from interleaved import compared, processor, rounds, versions
+from interleaved import ROUNDS, Call, Rows, compared, processor, rounds, versions, write
+from lines import drawn, problem
 from torch import Tensor
-from torch.distributions import Independent, Normal
 
-from cnfp_torchrl.bijectors import ExactSquash
-from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, Region, lexicographic_anchor
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 SCIPY = Path(__file__).with_name("anchors.json")
 TIGHT = 0.05
-"""The share of the states whose best slack is some thousandths."""
+"""The share of the states of facing rows whose best slack is some thousandths."""
 
-GROWTH = [(16, 2, 2), (256, 2, 2), (4096, 2, 2), (256, 6, 1), (256, 8, 1), (256, 6, 4)]
-"""Batch, dimension and number of constraints of the problems without a state to relax."""
+APART = [(16, 2, 2), (256, 2, 2), (4096, 2, 2), (256, 6, 2)]
+"""Batch, dimension and number of constraints of sets that lie apart."""
 
-SHARES = [(256, 2, 2), (256, 6, 1)]
-"""The same of those in which 1 % and 10 % of the states are relaxed."""
+FACING = [(16, 2, 2), (256, 2, 2), (4096, 2, 2), (256, 6, 1), (256, 8, 1), (256, 6, 4)]
+"""The same of facing rows."""
 
 
-def problem(batch: int, dim: int, constraints: int, relaxed: float = 0.0) -> list[ConstraintSet]:
+def facing_rows(
+    batch: int, dim: int, constraints: int, relaxed: float = 0.0
+) -> list[ConstraintSet]:
     """Return bounds and constraints: eight rows if it is one, else balls and pairs of rows.
 
     Args:
@@ -81,14 +83,6 @@ def problem(batch: int, dim: int, constraints: int, relaxed: float = 0.0) -> lis
     return sets
 
 
-def flow_of(sets: list[ConstraintSet]) -> Callable[[], Any]:
-    """Return a call that draws one action in each state, with its log-density."""
-    region = Region.build(sets)
-    base = Normal(torch.zeros_like(region.anchor), 1.0, validate_args=False)
-    squash = ExactSquash(region, validate_args=False)
-    return ConstrainedFlow(Independent(base, 1, validate_args=False), squash).rsample_and_log_prob
-
-
 def qpax_projection(sets: list[ConstraintSet]) -> Callable[[], Any]:
     """Return a call that projects an action of each state onto bounds and rows, compiled."""
     import jax
@@ -115,93 +109,90 @@ def qpax_projection(sets: list[ConstraintSet]) -> Callable[[], Any]:
     return lambda: compiled(wish, matrix, limits).block_until_ready()
 
 
-def measure(
-    case: tuple[int, int, int], relaxed: float, count: int, seconds: float, *, quick: bool
-) -> dict[str, Any]:
-    """Return the times of anchors and flow, of qpax where there are rows alone, and ratios."""
-    sets = problem(*case, relaxed)
-    calls: dict[str, Callable[[], Any]] = {
-        "anchor": lambda: lexicographic_anchor(sets),
-        "flow": flow_of(sets),
+def calls_of(case: tuple[int, int, int], *, facing: bool) -> dict[str, Call]:
+    """Return what is timed for one size: the flow, and anchors of several kinds of states."""
+    batch, dim, _ = case
+    kinds: dict[str, Callable[[], list[ConstraintSet]]] = {
+        "easy": lambda: problem(*case, tight=0.0),
+        "30 % tight": lambda: problem(*case, tight=0.3),
+        "1 % relaxed": lambda: problem(*case, tight=0.0, relaxed=0.01),
+        "10 % relaxed": lambda: problem(*case, tight=0.0, relaxed=0.1),
     }
-    if relaxed and case[2] == 1 and not quick and find_spec("qpax"):
-        calls["qpax"] = qpax_projection(problem(*case))
-    times = rounds(calls, count, seconds)
-    given = (~lexicographic_anchor(sets).active.all(-1)).double().mean().item()
-    row: dict[str, Any] = dict(zip(("batch", "dim", "constraints"), case, strict=True))
-    row |= {"relaxed": given}
-    row["ms"] = {name: found["ms"] for name, found in compared(times, "anchor").items()}
-    for other in set(times) - {"anchor"}:
-        ratio = compared(times, other)["anchor"]
-        row[f"/ {other}"] = {name: ratio[name] for name in ("ratio", "low", "high")}
-    return row
+    if facing:
+        shares = {"5 % tight": 0.0, "1 % relaxed": 0.01, "10 % relaxed": 0.1}
+        kinds = {name: partial(facing_rows, *case, share) for name, share in shares.items()}
+    calls: dict[str, Call] = {}
+    for name, make in kinds.items():
+        sets = make()
+        if not calls:
+            loc, scale = torch.zeros(batch, dim), torch.ones(batch, dim)
+            calls["exact flow"] = partial(drawn, Region.build(sets), loc, scale)
+        calls[f"anchors, {name}"] = partial(lexicographic_anchor, sets)
+    return calls
 
 
-def table(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str]:
-    """Return the results as Markdown."""
-    lines = [
-        "| batch | d | K | relaxed | anchor, ms | before, ms | flow, ms | / flow | quartiles "
-        "| / qpax |",
-        "|" + "---|" * 10,
-    ]
-    for i, row in enumerate(rows):
-        ratio, qpax = row["/ flow"], row.get("/ qpax")
-        old = f"{before[i]['ms']['anchor']:.2f}" if before else ""
-        lines.append(
-            f"| {row['batch']} | {row['dim']} | {row['constraints']} | {row['relaxed']:.0%} | "
-            f"{row['ms']['anchor']:.2f} | {old} | {row['ms']['flow']:.2f} | {ratio['ratio']:.1f} | "
-            f"{ratio['low']:.1f} to {ratio['high']:.1f} | "
-            + (f"{qpax['ratio']:.1f} of {row['ms']['qpax']:.2f} ms |" if qpax else "|")
-        )
-    return lines
+@torch.no_grad()
+def measure(cases: list[tuple[tuple[int, int, int], bool]], settings: Any) -> dict[str, Rows]:
+    """Return the times of all sizes, beside the flow and, where rows are all there is, qpax."""
+    results: dict[str, Rows] = {}
+    for case, facing in cases:
+        calls = calls_of(case, facing=facing)
+        beside = facing and case[2] == 1 and settings.qpax
+        if beside:
+            calls["qpax"] = qpax_projection(facing_rows(*case))
+        times = rounds(calls, settings.rounds, settings.seconds)
+        batch, dim, count = case
+        kind = "facing rows" if facing else "sets apart"
+        title = f"{kind}, batch {batch}, d = {dim}, K = {count}"
+        results[title] = compared(times, "exact flow")
+        if beside:
+            del times["exact flow"]
+            first = {"qpax": times.pop("qpax")}
+            results[f"{title}, beside qpax"] = compared({**first, **times}, "qpax")
+    return results
 
 
 def main() -> None:
     """Measure and write ``anchors.json`` and ``anchors.md``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="one small problem, for a test")
-    parser.add_argument("--rounds", type=int, default=9, help="rounds in which all take turns")
-    parser.add_argument("--before", type=Path, help="anchors.json of an older library, by this")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the results")
+    parser.add_argument("--quick", action="store_true", help="two small problems, for a test")
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    cases = [(case, 0.0) for case in GROWTH]
-    cases += [(case, share) for case in SHARES for share in (0.01, 0.1)]
-    count, seconds = arguments.rounds, 0.1
+    arguments.seconds, arguments.qpax = 0.1, bool(find_spec("qpax"))
+    cases = [(case, False) for case in APART] + [(case, True) for case in FACING]
     if arguments.quick:
-        cases, count, seconds = [((8, 2, 2), 0.0), ((8, 2, 1), 0.25)], 2, 1e-3
-    if not find_spec("qpax"):
-        print("qpax is not installed (pip install 'cnfp_torchrl[bench]'): its column stays empty.")
-    rows = [measure(case, share, count, seconds, quick=arguments.quick) for case, share in cases]
+        arguments.rounds, arguments.seconds, arguments.qpax = 2, 1e-3, False
+        cases = [((32, 2, 2), False), ((32, 2, 1), True)]
+    elif not arguments.qpax:
+        print("qpax is not installed (pip install 'cnfp_torchrl[bench]'): its rows are left out.")
     about = {
         "command": " ".join(["python experiments/benchmarks/anchor_times.py", *sys.argv[1:]]),
-        "processor": processor(),
-        "rounds": count,
-        "load": os.getloadavg()[0],
+        "processor": f"{processor()}; the process's own time on it",
+        "rounds": arguments.rounds,
         **versions("numpy", "qpax", "jax"),
+        "load before, over 1, 5 and 15 minutes": _load(),
     }
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    document = {"about": about, "rows": rows}
-    (arguments.output / "anchors.json").write_text(json.dumps(document, indent=1) + "\n")
-    before = json.loads(arguments.before.read_text())["rows"] if arguments.before else []
-    lines = ["# Time of anchors", "", *(f"- {key}: {value}" for key, value in about.items()), ""]
-    lines += [
-        "Medians over rounds in which all take turns; ratios are taken within a round. Processor "
-        "time of all threads. One constraint is eight rows, more are balls and pairs of rows; "
-        f"{TIGHT:.0%} of the states are tight. qpax projects one action of each state onto the "
-        "same rows where all can hold.",
-        "",
-        *table(rows, before),
-        "",
-        "On random intersections, beside SciPy (`python experiments/benchmarks/anchors.py`):",
-        "",
-        *(f"- {key}: {value}" for key, value in json.loads(SCIPY.read_text()).items()),
-        "",
-    ]
-    text = "\n".join(lines)
-    (arguments.output / "anchors.md").write_text(text)
-    print(text)
+    results = measure(cases, arguments)
+    about["load after"] = _load()
+    agreement = json.loads(SCIPY.read_text()).items()
+    write(
+        arguments.out / "anchors.json",
+        "Measured: anchors",
+        about,
+        results,
+        f"Of facing rows {TIGHT:.0%} of the states are tight in all mixes. On random sets, "
+        "beside SciPy (`python experiments/benchmarks/anchors.py`): "
+        + "; ".join(f"{key}: {value}" for key, value in agreement)
+        + ".",
+    )
+    sys.stdout.write((arguments.out / "anchors.md").read_text())
+
+
+def _load() -> str:
+    return ", ".join(f"{load:.1f}" for load in os.getloadavg())
 
 
 if __name__ == "__main__":

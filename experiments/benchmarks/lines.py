@@ -9,9 +9,7 @@ thread, and each line anew in a minute or so:
   `TanhNormal` in the plain environment, of both;
 - flow: constructing the exact flow, drawing and scoring, beside a `TanhNormal` that is constructed
   alike, with growth in batch, d and K;
-- anchors: finding anchors beside that flow, for states that are easy, tight or relaxed in several
-  shares, with growth in batch and d;
-- update, training: see `updates.py`, whose parts they are.
+- anchors, update, training: see `anchor_times.py` and `updates.py`.
 
 Random problems come from one generator with a fixed seed (`problem`).
 """
@@ -60,7 +58,6 @@ from cnfp_torchrl import (
     make_constrained_actor,
 )
 from cnfp_torchrl.bijectors import ExactSquash
-from cnfp_torchrl.geometry import lexicographic_anchor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -293,34 +290,11 @@ def time_flow(settings: Settings) -> dict[str, Rows]:
     return results
 
 
-@torch.no_grad()
-def time_anchors(settings: Settings) -> dict[str, Rows]:
-    """Return the times of finding anchors, beside drawing from the flow in the same states."""
-    results = {}
-    for batch, dim in [(256, 2)] if settings.quick else [(16, 2), (256, 2), (4096, 2), (256, 6)]:
-        loc, scale = torch.zeros(batch, dim), torch.ones(batch, dim)
-        calls: dict[str, Call] = {}
-        for name, tight, relaxed in (
-            ("easy", 0.0, 0.0),
-            ("30 % tight", 0.3, 0.0),
-            ("1 % relaxed", 0.0, 0.01),
-            ("10 % relaxed", 0.0, 0.1),
-        ):
-            sets = problem(batch, dim, 2, tight=tight, relaxed=relaxed)
-            if not calls:
-                calls["exact flow"] = partial(drawn, Region.build(sets), loc, scale)
-            calls[f"anchors, {name}"] = partial(lexicographic_anchor, sets)
-        times = settings.timed(calls)
-        results[f"anchors, batch {batch}, d = {dim}, K = 2"] = compared(times, "exact flow")
-    return results
-
-
 LINES: dict[str, Callable[[Settings], dict[str, Rows]]] = {
     "point-nav-step": partial(time_steps, "point navigation", [1, 16, 256, 4096]),
     "own-step": partial(time_steps, "own", [1, 16, 256, 4096, 65536]),
     "whole-path": time_whole_path,
     "flow": time_flow,
-    "anchors": time_anchors,
 }
 
 

@@ -8,11 +8,10 @@ import argparse
 import torch
 from torchrl.collectors import Collector
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from cnfp_torchrl import constrain_env, make_constrained_actor
 from cnfp_torchrl.modules import split_at_latent
+from cnfp_torchrl.objectives import ConstrainedPPOLoss
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 
@@ -31,11 +30,10 @@ def main() -> None:
     env = constrain_env(base_env, BatteryGeometry(), ObstacleGeometry())
     network = torch.nn.Sequential(MLP(5, 4, num_cells=[64, 64]), NormalParamExtractor())
     actor = make_constrained_actor(network, env)
-    policy, latent_actor = split_at_latent(actor)  # for the collector, and for the loss
+    policy = split_at_latent(actor).policy  # also stores latents, which the loss scores
 
     critic = ValueOperator(MLP(5, 1, num_cells=[64, 64]), in_keys=["observation"])
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
-    loss = ClipPPOLoss(latent_actor, critic, normalize_advantage=True, entropy_coeff=1e-3)
+    loss = ConstrainedPPOLoss(actor, critic, entropy_coeff=1e-3)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     frames = arguments.agents * arguments.horizon
     collector = Collector(
@@ -47,7 +45,7 @@ def main() -> None:
     )
     violations = torch.zeros(len(env.constraint_names))
     for iteration, batch in enumerate(collector):
-        advantage(batch)
+        loss.value_estimator(batch)
         steps = batch.reshape(-1)
         violations += steps["next", "cost"].sum(0)
         fresh = loss(steps)  # nothing was updated since: the ratios must be 1

@@ -7,18 +7,17 @@ carries them to allowed actions. Added to the action, they would break the const
 """
 
 import argparse
-import math
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
-from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
-from torchrl.objectives import SoftUpdate, TD3Loss
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate
 
-from cnfp_torchrl.envs import constrain_env, constraint_bijectors
-from cnfp_torchrl.modules import ConstrainedFlowModule, FlowMap
+from cnfp_torchrl import constrain_env, make_constrained_actor
+from cnfp_torchrl.modules import split_at_latent
+from cnfp_torchrl.objectives import ConstrainedTD3Loss
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.training.networks import action_value_network, deterministic_network
 
 
 def main() -> None:
@@ -33,23 +32,10 @@ def main() -> None:
 
     base_env = PointNavEnv([arguments.agents], seed=arguments.seed)
     env = constrain_env(base_env, BatteryGeometry(), ObstacleGeometry())
-    bijectors = constraint_bijectors(env)
-    flow = FlowMap(ConstrainedFlowModule(env.action_spec_unbatched, bijectors))
-    network = TensorDictModule(MLP(5, 2, num_cells=[64, 64]), ["observation"], ["latent"])
-    # The latent starts near N(0, 1) and ends near the network's choice.
-    noise = AdditiveGaussianModule(
-        Unbounded(2), 1.0, 0.1, annealing_num_steps=arguments.steps, action_key="latent"
-    )
-    policy = TensorDictSequential(network, noise, flow)
-
-    # To the loss, the latent is the action, and the flow the first layer of the critic.
-    actor = TensorDictSequential(network, flow)
-    critic = TensorDictSequential(
-        flow, ValueOperator(MLP(7, 1, num_cells=[64, 64]), in_keys=["observation", "action"])
-    )
-    loss = TD3Loss(actor, critic, bounds=(-math.inf, math.inf))
-    loss.set_keys(action="latent")
-    loss.make_value_estimator(gamma=0.99)
+    # The scale of its Gaussian is that of exploration, and is not learned.
+    actor = make_constrained_actor(deterministic_network(5, 2, hidden=[64, 64], noise=0.3), env)
+    policy = split_at_latent(actor).policy  # also stores latents, the actions to the loss
+    loss = ConstrainedTD3Loss(actor, action_value_network(5, 2, hidden=[64, 64]))
     target = SoftUpdate(loss, tau=0.005)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), lr=1e-3)
     critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=1e-3)
@@ -66,11 +52,10 @@ def main() -> None:
     )
     for batch in collector:
         buffer.extend(batch.reshape(-1))
-        noise.step(batch.numel())
         for update in range(arguments.updates):
             sample = buffer.sample()
             critic_optimizer.zero_grad()
-            loss.value_loss(sample)[0].backward()
+            loss.critic_loss(sample)["loss_qvalue"].backward()
             critic_optimizer.step()
             if update % 2 == 0:
                 actor_optimizer.zero_grad()

@@ -14,6 +14,8 @@ FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
 RANDOM_ACTIONS = "random_actions"
 """The folder in `DATA` of what random actions did, a file for each task."""
+SAFE_CONTROL = "safe_control"
+"""The folder in `DATA` of controllers trained through layers, a file for each run."""
 
 ACTION_SIZES = {
     "half_cheetah_power": 6,
@@ -36,6 +38,9 @@ FLOWS = {
     "unconstrained": "unconstrained",
 }
 """Our methods, by the flow of ``conf/flow`` that each is."""
+
+OURS = ("hard", "soft")
+"""Those of them that are bijections; the others are baselines."""
 
 PEER = "sb3_projection"
 """Stable-Baselines3's SAC, whose actions the environment projects."""

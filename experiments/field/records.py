@@ -112,7 +112,7 @@ class Record:
     def all_violations(self) -> int:
         """Violating steps in training and both evaluations, all constraints together."""
         counts = (self.violations, self.greedy.violations, self.stochastic.violations)
-        return sum(sum(each.values()) for each in counts)
+        return sum(sum(by_constraint.values()) for by_constraint in counts)
 
 
 def read_records(data: Path) -> list[Record]:

@@ -19,7 +19,17 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.field.jobs import ACTION_SIZES, DATA, FOLDER, METHODS, RANDOM_ACTIONS, TRAINED
+from experiments.field.jobs import (
+    ACTION_SIZES,
+    DATA,
+    FOLDER,
+    METHODS,
+    ONE_SEED,
+    OURS,
+    RANDOM_ACTIONS,
+    SAFE_CONTROL,
+    TRAINED,
+)
 from experiments.field.records import Record, read_records
 
 PAGE = FOLDER / "README.md"
@@ -73,12 +83,12 @@ def draw(records: Sequence[Record], path: Path) -> None:
     panels: Sequence[Axes] = figure.subplots(1, len(TRAINED))
     for axes, task in zip(panels, TRAINED, strict=True):
         for method, label in LABELS.items():
-            chosen = [each for each in records if (each.task, each.method) == (task, method)]
+            chosen = [run for run in records if (run.task, run.method) == (task, method)]
             if not chosen:
                 continue
-            curves = [curve(each) for each in chosen]
+            curves = [curve(run) for run in chosen]
             common = sorted(set.intersection(*(set(steps) for steps, _ in curves)))
-            values = np.array([np.interp(common, *each) for each in curves])
+            values = np.array([np.interp(common, *points) for points in curves])
             style = "--" if method == "unconstrained" else "-"
             axes.plot(common, np.median(values, 0), style, color=label.color, label=label.text)
             axes.fill_between(
@@ -101,10 +111,12 @@ def draw(records: Sequence[Record], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def spread(values: Sequence[float]) -> str:
-    """Return the median, and the least and most where they differ."""
-    text = f"{median(values):,.0f}"
-    return text if len(values) == 1 else f"{text} [{min(values):,.0f}, {max(values):,.0f}]"
+def spread(values: Sequence[float], digits: int = 0) -> str:
+    """Return the median, and the least and most of several values."""
+    text = f"{median(values):,.{digits}f}"
+    if len(values) == 1:
+        return text
+    return f"{text} [{min(values):,.{digits}f}, {max(values):,.{digits}f}]"
 
 
 def training_table(records: Sequence[Record], task: str) -> list[str]:
@@ -117,29 +129,52 @@ def training_table(records: Sequence[Record], task: str) -> list[str]:
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method in LABELS:
-        chosen = [each for each in records if (each.task, each.method) == (task, method)]
+        chosen = [run for run in records if (run.task, run.method) == (task, method)]
         if not chosen:
             continue
         greedy, stochastic = (
-            spread([float(np.mean(getattr(each, kind).returns)) for each in chosen])
+            spread([float(np.mean(getattr(run, kind).returns)) for run in chosen])
             for kind in ("greedy", "stochastic")
         )
-        relaxed = max(max(each.relaxed.values(), default=0.0) for each in chosen)
-        moved = median(each.stochastic.moved for each in chosen)
+        relaxed = max(max(run.relaxed.values(), default=0.0) for run in chosen)
+        moved = median(run.stochastic.moved for run in chosen)
         cells = [
             LABELS[method].text,
             str(len(chosen)),
             greedy,
             stochastic,
-            f"{max(each.all_violations for each in chosen):,}",
+            f"{max(run.all_violations for run in chosen):,}",
             f"{relaxed:.1%}",
             f"{moved:.0%}",
-            f"{median(each.milliseconds for each in chosen):.2f}",
-            f"{median(each.steps_per_second for each in chosen):.0f}",
-            f"{median(each.projections for each in chosen):,.0f}",
+            f"{median(run.milliseconds for run in chosen):.2f}",
+            f"{median(run.steps_per_second for run in chosen):.0f}",
+            f"{median(run.projections for run in chosen):,.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
+    return [*lines, "", *compared(records, task)]
+
+
+def compared(records: Sequence[Record], task: str) -> list[str]:
+    """Return a sentence on the best of ours and the best peer, by the median stochastic return."""
+    found: dict[bool, tuple[float, str]] = {}
+    for method, label in LABELS.items():
+        returns = [
+            float(np.mean(run.stochastic.returns))
+            for run in records
+            if (run.task, run.method) == (task, method)
+        ]
+        if returns and method not in ONE_SEED:
+            is_ours, result = method in OURS, (median(returns), label.text)
+            found[is_ours] = max(found.get(is_ours, result), result)
+    if len(found) < 2:
+        return []
+    (mine, my_name), (theirs, their_name) = found[True], found[False]
+    verdict = "at least that of" if mine >= theirs else "below"
+    return [
+        f"Of these runs, the best of ours by stochastic return ({my_name}) has {mine:,.0f}, {verdict} "
+        f"the best constrained peer's ({their_name}), {theirs:,.0f}.",
+        "",
+    ]
 
 
 def random_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -172,13 +207,79 @@ def random_table(rows: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", f"{made_by}; {'; '.join(made_with)}.", ""]
 
 
+CONTROLLERS = {
+    "recession": "recession (ours)",
+    "hardnet_aff": "HardNet-Aff, re-implemented",
+    "cbf_qp": "CBF-QP, which learns nothing",
+}
+
+
+def safe_control_table(runs: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
+    """Return the table of controllers trained through layers."""
+    lines = [
+        "## Safe control",
+        "",
+        "HardNet's unicycle past two ellipses (Min and Azizan 2024, "
+        "[arXiv 2410.10807](https://arxiv.org/abs/2410.10807)), in float64 and with the published "
+        "starts (seed 17), network, batches and learning rate. Objective: the mean cost of the 84 "
+        "starts of the test, medians over seeds [least, most]. Violations: controls of the test "
+        "that broke a barrier, with zero tolerance, by a judge that shares no formula with the "
+        "rows. By HardNet's own measure: excesses over a barrier, integrated over an episode; the "
+        "largest, and the number of barriers beyond 1e-4, means over starts. The aim: an objective "
+        "of at most 500 without a violation, no slower than HardNet-Aff.",
+        "",
+        "| controller | epochs | seeds | objective | violations | largest excess | barriers beyond "
+        "1e-4 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, title in CONTROLLERS.items():
+        chosen = [run for run in runs if run["layer"] == name]
+        if not chosen:
+            continue
+        cells = [
+            title,
+            str(max(run["epochs"] for run in chosen)),
+            str(len(chosen)),
+            spread([run["objective"] for run in chosen], 1),
+            f"{sum(run['violations'] for run in chosen):,}",
+            f"{max(run['excess']['largest'] for run in chosen):.3g}",
+            f"{max(run['excess']['count'] for run in chosen):.3g}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += [
+        "",
+        "Published: HardNet-Aff 518.85 (8.71) after 1,000 epochs, a soft penalty 480 with "
+        "violations, CBF-QP 948 (its baseline adds the nominal control twice).",
+        "",
+    ]
+    if times is not None:
+        forward, backward = times["forward"], times["backward"]
+        lines += [
+            f"Network, rows and layer of {times['states']} states take "
+            f"{forward['recession']:.2f} ms ({forward['ratio']:.2f} times HardNet-Aff's, in the "
+            f"same turn), with the gradient {backward['recession']:.2f} ms "
+            f"({backward['ratio']:.2f} times); processor time, "
+            f"medians of {times['turns']} turns, `python -m experiments.field.safe_control times`; "
+            f"torch {times['about']['torch']}, {times['about']['machine']}.",
+            "",
+        ]
+    return lines
+
+
 def results(data: Path, page: Path) -> str:
     """Return what stands between the marks, and draw the figure it shows."""
     lines: list[str] = []
     if records := read_records(data):
         draw(records, page.parent / "images" / "training.png")
-        steps, about = {each.steps for each in records}, records[0].about
-        devices = sorted({f"{each.about['machine']}, {each.about['device']}" for each in records})
+        steps = {run.steps for run in records}
+        made_with = sorted(
+            {
+                "torch {torch}, TorchRL {torchrl}, MuJoCo {mujoco}; {machine}, {device}".format(
+                    **run.about
+                )
+                for run in records
+            }
+        )
         lines += [
             "## Training",
             "",
@@ -193,13 +294,17 @@ def results(data: Path, page: Path) -> str:
             "machine; steps a second those of training, other runs beside it.",
             "",
             *(line for task in TRAINED for line in training_table(records, task)),
-            f"torch {about['torch']}, TorchRL {about['torchrl']}, MuJoCo {about['mujoco']}; "
-            f"{'; '.join(devices)}; one thread a run.",
+            f"One thread a run: {' | '.join(made_with)}.",
             "",
         ]
     paths = [data / RANDOM_ACTIONS / f"{task}.json" for task in ACTION_SIZES]
     if rows := [json.loads(path.read_text()) for path in paths if path.exists()]:
         lines += random_table(rows)
+    folder = data / SAFE_CONTROL
+    if runs := [json.loads(path.read_text()) for path in sorted(folder.glob("*/*.json"))]:
+        taken = folder / "times.json"
+        times = json.loads(taken.read_text()) if taken.exists() else None
+        lines += safe_control_table(runs, times)
     return "\n".join(lines)
 
 

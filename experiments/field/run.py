@@ -69,22 +69,22 @@ def run_all(
             while waiting and len(running) < side_by_side:
                 running.append(start(waiting.pop(0), data, overrides))
             time.sleep(PAUSE)
-            for each in [one for one in running if one.process.poll() is not None]:
-                running.remove(each)
-                each.log.close()
-                taken = time.perf_counter() - each.since
-                if each.process.returncode:
-                    failed.append(each.job)
-                    tell(f"FAILED after {taken:.0f} s: {each.job}, see {each.log.name}")
+            for run in [run for run in running if run.process.poll() is not None]:
+                running.remove(run)
+                run.log.close()
+                taken = time.perf_counter() - run.since
+                if run.process.returncode:
+                    failed.append(run.job)
+                    tell(f"FAILED after {taken:.0f} s: {run.job}, see {run.log.name}")
                 else:
-                    tell(f"done in {taken:.0f} s: {each.job}")
+                    tell(f"done in {taken:.0f} s: {run.job}")
     finally:
-        for each in running:
-            each.process.terminate()
-        for each in running:
-            each.process.wait()
-            each.log.close()
-    return failed, [each.job for each in running] + waiting
+        for run in running:
+            run.process.terminate()
+        for run in running:
+            run.process.wait()
+            run.log.close()
+    return failed, [run.job for run in running] + waiting
 
 
 def start(job: Job, data: Path, overrides: list[str]) -> Running:
@@ -93,7 +93,14 @@ def start(job: Job, data: Path, overrides: list[str]) -> Running:
     path.parent.mkdir(parents=True, exist_ok=True)
     log = path.with_suffix(".log").open("wb")
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    command = [sys.executable, "-m", "experiments.field.one", job.task, job.method, str(job.seed)]
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.field.single_run",
+        job.task,
+        job.method,
+        str(job.seed),
+    ]
     process = subprocess.Popen(
         [*command, "--data", str(data), *overrides],
         stdout=log,
@@ -121,7 +128,7 @@ def arguments() -> Any:
     parser.add_argument("--device", help="of networks and updates, such as cuda; else the default")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the records")
     given, overrides = parser.parse_known_args()
-    if foreign := [each for each in overrides if each.startswith("-") or "=" not in each]:
+    if foreign := [text for text in overrides if text.startswith("-") or "=" not in text]:
         parser.error(f"expected key=value, given {foreign}")
     given.overrides = overrides + ([f"device={given.device}"] if given.device else [])
     return given

@@ -47,9 +47,9 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     arguments = ["-m", *TINY, *broken, f"hydra.sweep.dir='{sweep}'"]
     done = run("train", *arguments, cwd=tmp_path)
     assert done.returncode == 1
-    # As soon as it has failed, and not behind the others.
-    assert "0_lr-1e30: " in done.stderr.partition("Error executing job")[0]
     first, second = table(sweep)
+    # As soon as it has failed, and not behind the others.
+    assert f"{first['folder']}: " in done.stderr.partition("Error executing job")[0]
     assert first["state"].startswith("failed: ")
     assert "nan" in first["state"]
     assert second["state"] == "done"

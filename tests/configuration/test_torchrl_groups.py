@@ -1,9 +1,10 @@
 """Our parts in TorchRL's groups of configurations, and its own trainer that trains with them."""
 
+import sys
 from copy import deepcopy
 from dataclasses import fields
 from functools import cache
-from importlib import import_module
+from importlib import import_module, reload
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,6 +23,7 @@ from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.objectives import ConstrainedSACLoss
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
+OUR_MODULE = "cnfp_torchrl.configuration.torchrl_groups"
 OURS = {
     "env": ["constrained"],
     "transform": ["action_guard", "constrained_actions", "constraint_cost", "reward_penalty"],
@@ -43,8 +45,10 @@ def registered() -> tuple[ModuleType, Any]:
     store = ConfigStore.instance()
     before = deepcopy(store.repo)
     try:
-        import_module("torchrl.trainers.algorithms.configs")
-        return import_module("cnfp_torchrl.configuration.torchrl_groups"), store.repo
+        for name in ("torchrl.trainers.algorithms.configs", OUR_MODULE):
+            # An example may have imported them before, into a store that is gone.
+            reload(sys.modules[name]) if name in sys.modules else import_module(name)
+        return sys.modules[OUR_MODULE], store.repo
     finally:
         store.repo = before
 

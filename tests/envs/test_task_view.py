@@ -6,6 +6,7 @@ from functools import partial
 import gymnasium
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
+from hydra import compose, initialize_config_dir
 from tensordict import TensorDict
 from torchrl.envs import (
     Compose,
@@ -19,8 +20,10 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from cnfp_torchrl.envs.task_view import Map, Series, TaskView, find_task_view
+from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.envs.task_view import Map, Series, ShowTask, TaskView, find_task_view
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
+from cnfp_torchrl.training.agent import build_environment
 
 
 class Swing(TaskView):
@@ -69,6 +72,32 @@ def test_environments_that_show_nothing_may_be_asked_before_any_reset(env: EnvBa
     view = find_task_view(env)
     assert view.map is None
     assert not view.series
+
+
+def test_any_environment_may_be_given_a_view(env: EnvBase) -> None:
+    view = Swing()
+    assert find_task_view(TransformedEnv(env, ShowTask(view), auto_unwrap=False)) is view
+
+
+@pytest.mark.parametrize("given", [None, {"name": "x"}, Swing])
+def test_what_is_no_view_is_refused(given: object) -> None:
+    with pytest.raises(TypeError, match=r"env\.view: expected an instance of a class derived"):
+        ShowTask(given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [
+        ([], "PointNavView"),
+        (["+env.view._target_=tests.envs.test_task_view.Swing"], "Swing"),
+    ],
+)
+def test_a_configuration_s_view_takes_the_place_of_the_environment_s(
+    overrides: list[str], found: str
+) -> None:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", overrides)
+    assert type(find_task_view(build_environment(config))).__name__ == found
 
 
 def test_no_environment_shows_nothing() -> None:

@@ -4,12 +4,14 @@ import importlib.util
 import runpy
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
 
@@ -21,6 +23,13 @@ def place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Examples import each other; MuJoCo leaves a log where it runs."""
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def store(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give a script a store of configurations of its own to register in, as a process has."""
+    store = ConfigStore.instance()
+    monkeypatch.setattr(store, "repo", deepcopy(store.repo))
 
 
 @pytest.fixture

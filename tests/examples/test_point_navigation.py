@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from tensordict import TensorDictBase
-from torchrl.objectives import ClipPPOLoss
 
 from cnfp_torchrl.envs import constrain_env
+from cnfp_torchrl.objectives import ConstrainedPPOLoss
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
@@ -131,15 +131,15 @@ def test_ppo_ratios_are_exact_before_each_update(
 ) -> None:
     """The first loss of an iteration sees the data under the parameters that collected it."""
     fresh: list[TensorDictBase] = []
-    forward = ClipPPOLoss.forward
+    forward = ConstrainedPPOLoss.forward
 
-    def spy(self: ClipPPOLoss, tensordict: TensorDictBase) -> TensorDictBase:
+    def spy(self: ConstrainedPPOLoss, tensordict: TensorDictBase) -> TensorDictBase:
         losses = forward(self, tensordict)
         if len(tensordict) == 960:  # the whole iteration
             fresh.append(losses)
         return losses
 
-    monkeypatch.setattr(ClipPPOLoss, "forward", spy)
+    monkeypatch.setattr(ConstrainedPPOLoss, "forward", spy)
     printed = run("ppo_latent", *TINY["ppo_latent"])
     assert len(fresh) == 2
     for losses in fresh:

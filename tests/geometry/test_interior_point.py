@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Ellipsoid, PositivePart, WeightedL1Ball
-from cnfp_torchrl.geometry.anchor.interior_point import ConeScaling
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    Ellipsoid,
+    HalfSpaces,
+    PositivePart,
+    WeightedL1Ball,
+)
+from cnfp_torchrl.geometry.anchor.closed_form import maximize_slack_over_box
+from cnfp_torchrl.geometry.anchor.interior_point import ConeScaling, maximize_slack
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
 from tests.geometry.cases import CASES, Case
@@ -110,6 +119,42 @@ def test_what_is_required_is_kept() -> None:
         best = intersection.maximize(required, trial, counts, np.zeros((1, 2)), close)
         assert best.slack.item() == pytest.approx(-1 - least, abs=1e-6)
         np.testing.assert_allclose(best.action, [[1 - least, 0.0]], rtol=0, atol=1e-3)
+
+
+def test_the_closed_form_is_what_newtons_method_finds() -> None:
+    """Of balls and rows that other sets keep at a distance, with weights that certify it."""
+    batch, dim = 60, 3
+    ones = torch.ones(batch, dim, dtype=torch.float64)
+    half = 0.3 + 0.5 * torch.rand(batch, dim).double()
+    ball = Ball(2 * torch.randn(batch, dim).double(), 0.1 + torch.rand(batch).double())
+    rows = HalfSpaces(torch.randn(batch, 2, dim).double(), torch.randn(batch, 2).double() - 1)
+    for each, count in ((ball, 1), (rows, 2)):
+        intersection = Intersection.of([Box(-ones, ones), Box(-half, 0.8 * half), each])
+        counts = np.ones((batch, 4 * dim + count), dtype=bool)
+        trial = counts & (np.arange(4 * dim + count) >= 4 * dim)
+        required = np.full(counts.shape, 1e-3)
+        at = intersection.described
+        problem = intersection.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
+        start, asked = np.zeros((batch, dim)), []
+
+        def watched(lower: Array, upper: Array, index: Index) -> Flags:
+            asked.append(len(index))  # noqa: B023 - called before it changes
+            return close(lower, upper, index)
+
+        best = maximize_slack_over_box(problem, start, watched)
+        expected = maximize_slack(problem, start, close)
+        np.testing.assert_allclose(best.slack, expected.slack, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(best.upper_bound, expected.upper_bound, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(problem.slack(best.action), best.slack, rtol=0, atol=1e-9)
+        # Most need no search.
+        assert asked[0] == batch
+        assert asked[1:] == [] or max(asked[1:]) < 0.6 * batch
+        # Whatever the point, the weighted slacks stay below the bound.
+        assert best.weights is not None
+        point = (2 * np.random.default_rng(0).random((batch, dim)) - 1) * half.numpy() * 0.8
+        rooms = problem.rooms(problem.at(point))
+        total = (best.weights * rooms).sum(0) * problem.unit
+        assert (total <= best.upper_bound + 1e-6).all()
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -138,6 +138,14 @@ def test_the_worst_of_several_impossible_rows_does_not_set_the_others_amounts() 
     torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * DEPTH)
 
 
+def test_rows_that_miss_by_the_same_at_some_point_do_not_share_an_amount() -> None:
+    """From the middle both rows miss by 2 where the first one is nearest; the second can do 1."""
+    rows = HalfSpaces(t([1.0, 0.0], [0.0, 1.0]), t(-3.0, -2.0))
+    amounts = lexicographic_anchor([BOUNDS, rows]).relaxation[1]
+    expected = t(2.0, 1.0) + 2 * DEPTH + MORE
+    torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * DEPTH)
+
+
 def test_depth_is_left_however_many_sets_give_way() -> None:
     """The example of a rule that minimizes over the region itself, and is left without one."""
     sets = [BOUNDS, HalfSpaces(t([0.0, -1.0]), t(-5.0)), HalfSpaces(t([-1.0, 0.0]), t(-5.0))]

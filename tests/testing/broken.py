@@ -200,6 +200,11 @@ class AroundNotWritten(PlainBall):
 class DroppedByInfinity(PlainBall):
     """Infinite radii do not bind, but their gradients are no numbers."""
 
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        # Adds nothing, but the gradient of a root at 0, which infinite radii bring about.
+        scaled = direction / self.radius.unsqueeze(-1)
+        return super().gauge(direction, anchor) + 0 * (scaled * scaled).sum(-1).sqrt()
+
     def unless_dropped(self, active: Tensor, center: Tensor, radius: Tensor) -> Self:
         wide = torch.where(active, self.radius, torch.inf)
         return type(self)(self.center, wide, validate_args=False)

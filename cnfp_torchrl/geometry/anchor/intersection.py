@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 import torch
 
+from cnfp_torchrl.geometry.anchor.closed_form import maximize_slack_over_box
 from cnfp_torchrl.geometry.anchor.cutting_planes import maximize_slack_by_cuts
 from cnfp_torchrl.geometry.anchor.interior_point import Best, Settled, maximize_slack
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program
@@ -141,7 +142,9 @@ class Intersection:
         at = self.described
         problem = self.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
         if not self.plain:
-            return maximize_slack(problem, start, settled)
+            over_box = not trial[:, self.rows_of(0)].any()
+            solve = maximize_slack_over_box if over_box else maximize_slack
+            return solve(problem, start, settled)
         sets = [self.sets[i] for i in self.plain]
         rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(

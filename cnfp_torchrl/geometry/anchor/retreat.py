@@ -44,7 +44,7 @@ def retreat(
     rooms, there = (some.row_slacks(point) - required + gain for point in (best.action, before))
     kept = counts & (sure | (rooms > 0)) & np.isfinite(rooms)
     rooms, change = np.where(kept, rooms, np.inf), np.where(kept, there - rooms, 0.0)
-    end = np.minimum(np.where(change < 0, rooms / -change, np.inf).min(-1), 1)
+    end = np.clip(np.where(change < 0, rooms / -change, np.inf).min(-1), 0, 1)
     part = np.concatenate([np.zeros((1, len(end))), SHARES[:, None] * end])
     least = (rooms + part[..., None] * change).min(-1)
     chosen = part[least.argmax(0), np.arange(len(end))]

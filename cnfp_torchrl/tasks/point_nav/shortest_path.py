@@ -102,7 +102,9 @@ class ShortestPath(nn.Module):
         # not compared side by side with each node.
         seen_from = ((distances > 0) * self.side_codes[:, *last]).sum(1, dtype=torch.int32)
         lengths = embedding(seen_from + self.first_rows[:, *last], self.node_lengths).amax(0)
-        distance = torch.hypot(x.unsqueeze(-1) - self.node_x, y.unsqueeze(-1) - self.node_y)
+        # Not `torch.hypot`, which takes as long as all of this at large batches.
+        along_x, along_y = x.unsqueeze(-1) - self.node_x, y.unsqueeze(-1) - self.node_y
+        distance = torch.addcmul(along_x.square(), along_y, along_y).sqrt()
         shortest, node = (distance + lengths).min(-1)
         found = shortest < self.far
         known = embedding(node, self.node_table)

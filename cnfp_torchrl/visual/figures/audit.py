@@ -56,7 +56,7 @@ def audit_figure(report: AuditReport) -> Figure:
     tried there.
 
     Args:
-        report: of `cnfp_torchrl.audit.audit`.
+        report: The report of `cnfp_torchrl.audit.audit`.
     """
     colors = constraint_colors(report.order) | {TOGETHER: INK}
     scenes = [scene for scene in report.worst_states if scene.actions.shape[-1] == 2][:_MOST_SCENES]
@@ -99,11 +99,12 @@ _LED_INTO = "led into a violation\nsteps of the policy"
 
 
 def _draw_numbers(part: SubFigure, report: AuditReport, colors: Mapping[str, str]) -> None:
-    found = [each for findings in report.sources.values() for each in findings]
+    found = [metrics for findings in report.sources.values() for metrics in findings]
     flaws = {
         title: share_of
         for i, (title, share_of) in enumerate(_FLAWS.items())
-        if i == 0 or any((share := share_of(each)) is not None and share.count for each in found)
+        if i == 0
+        or any((share := share_of(metrics)) is not None and share.count for metrics in found)
     }
     led_into = {name: count for name, count in report.executed.led_into.items() if count}
     titles = [*flaws, *([_LED_INTO] if led_into else []), *_FINDINGS, _TIGHTNESS]
@@ -118,12 +119,12 @@ def _draw_numbers(part: SubFigure, report: AuditReport, colors: Mapping[str, str
         axes.set_axisbelow(True)
     height = 0.7 / len(report.sources)
     for i, findings in enumerate(report.sources.values()):
-        for each in findings:
-            at = names.index(each.name) + (i - (len(report.sources) - 1) / 2) * height
-            style: _Bar = {"height": 0.85 * height, "color": colors[each.name], "faint": i > 0}
+        for metrics in findings:
+            at = names.index(metrics.name) + (i - (len(report.sources) - 1) / 2) * height
+            style: _Bar = {"height": 0.85 * height, "color": colors[metrics.name], "faint": i > 0}
             for title, share_of in (flaws | _FINDINGS).items():
-                _draw_share(panels[title], share_of(each), at, counted=title in flaws, **style)
-            _draw_spread(panels[_TIGHTNESS], each.volume, at, **style)
+                _draw_share(panels[title], share_of(metrics), at, counted=title in flaws, **style)
+            _draw_spread(panels[_TIGHTNESS], metrics.volume, at, **style)
     for name, count in led_into.items():
         at = names.index(name) if name in names else len(names) - 1
         panels[_LED_INTO].barh(at, count, 0.6, color=colors.get(name, INK), alpha=0.9, zorder=2)
@@ -209,7 +210,7 @@ def _kinds(scene: WorstState) -> list[NDArray[np.bool_]]:
 
 
 def _state_text(state: Mapping[str, object]) -> str:
-    """Return a state in few words, or nothing where it has many entries."""
+    """Return a state as a short text, empty where it has many entries."""
     parts = []
     for name, value in state.items():
         numbers = value if isinstance(value, list) else [value]

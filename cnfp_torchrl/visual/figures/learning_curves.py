@@ -30,7 +30,7 @@ RELAXATIONS = {
 }
 """What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
 
-_WORDS = {"qvalue": "critic", "alpha": "α"}
+_LOSSES = {"qvalue": "critic", "alpha": "α"}
 _TITLES = {"alpha": "entropy coefficient α", "entropy": "policy entropy (nats)"}
 _COLUMNS = 4
 
@@ -39,7 +39,7 @@ def read_scalars(metrics: Path) -> dict[str, Curve]:
     """Return the logged scalars by name, such as ``train/return``; none if there is no such folder.
 
     Args:
-        metrics: the folder of the CSV logger's experiment, which holds ``scalars/``.
+        metrics: The folder of the CSV logger's experiment, which holds ``scalars/``.
 
     Raises:
         ValueError: when a file is not rows of step and value, naming it.
@@ -66,13 +66,13 @@ def learning_curves(
 ) -> Figure:
     """Draw return, cumulative violations by constraint, and whatever else was logged of learning.
 
-    How constraints gave way is drawn where one did. What was not logged is said in its panel; a run
-    without any scalars gives a figure that says so.
+    Relaxations are drawn where a constraint was relaxed. A panel without a curve says why; so does
+    the figure of a run without any scalars.
 
     Args:
-        curves: steps and values by name, see `read_scalars`.
-        colors: of the constraints; None chooses them by the names found.
-        title: above the panels.
+        curves: Steps and values by name, see `read_scalars`.
+        colors: The colors of the constraints; None chooses them by the names found.
+        title: The title above the panels.
     """
     if not curves:
         return message_figure(
@@ -124,7 +124,7 @@ def learning_curves(
 def _title(name: str) -> str:
     group, _, last = name.rpartition("/")
     if group == "loss" and last != "entropy":
-        return f"{_WORDS.get(last, last)} loss"
+        return f"{_LOSSES.get(last, last)} loss"
     return _TITLES.get(last, last.replace("_", " "))
 
 

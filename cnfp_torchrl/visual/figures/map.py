@@ -37,9 +37,9 @@ def draw_map(axes: Axes, plane: Map, *, labels: bool = True) -> None:
     """Draw what stands in a map, in its units.
 
     Args:
-        axes: an empty panel.
-        plane: the map.
-        labels: name the axes.
+        axes: An empty panel.
+        plane: The map.
+        labels: Whether the axes are named.
     """
     (x_low, x_high), (y_low, y_high) = plane.x, plane.y
     inside = Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, transform=axes.transData)
@@ -80,9 +80,9 @@ def draw_moves(axes: Axes, scene: Scene, colors: Mapping[str, str]) -> None:
     """Draw the map with each constraint's set, and where the agent may move.
 
     Args:
-        axes: an empty panel.
-        scene: of a task with a map.
-        colors: of the constraints.
+        axes: An empty panel.
+        scene: A scene of a task with a map.
+        colors: The colors of the constraints.
     """
     view, shown = scene.setting.view, scene.on_map(targets=0)
     assert view.map is not None
@@ -90,7 +90,7 @@ def draw_moves(axes: Axes, scene: Scene, colors: Mapping[str, str]) -> None:
     draw_map(axes, view.map)
     drawn = zip(scene.setting.constraints, shown.sets, shown.dropped, strict=False)
     for name, own, dropped in drawn:
-        for line, dashes in [*((each, "-") for each in own), *((each, ":") for each in dropped)]:
+        for line, dashes in [*((line, "-") for line in own), *((line, ":") for line in dropped)]:
             axes.plot(*line.T, color=colors[name], lw=1.4, linestyle=dashes, zorder=5, label=name)
     for edge in shown.allowed:
         axes.fill(*edge.T, facecolor=(0, 0, 0, 0.18), edgecolor=INK, linewidth=0.9, zorder=6)
@@ -109,9 +109,9 @@ def map_legend(view: TaskView) -> list[Line2D]:
     """Return legend entries for what stands in a task's map."""
     shapes = () if view.map is None else view.map.shapes
     return [
-        legend_entry(each.label, marker="s", color=each.color, markersize=7)
-        for each in shapes
-        if each.label
+        legend_entry(shape.label, marker="s", color=shape.color, markersize=7)
+        for shape in shapes
+        if shape.label
     ]
 
 
@@ -129,8 +129,8 @@ def _values(scene: Scene) -> Sequence[str]:
     """Return the task's series in this state, as a line of a title."""
     view = scene.setting.view
     values = view.series_values(scene.snapshot.state) if view.series else {}
-    told = [f"{s.name} {float(values[s.name]):.3g} {s.unit}".rstrip() for s in view.series]
-    return [", ".join(told)] if told else []
+    texts = [f"{s.name} {float(values[s.name]):.3g} {s.unit}".rstrip() for s in view.series]
+    return [", ".join(texts)] if texts else []
 
 
 def _goal(reached: bool) -> dict[str, Any]:

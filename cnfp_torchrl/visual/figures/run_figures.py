@@ -45,10 +45,10 @@ def draw_run_figures(
     actor is a constrained one, ``flow_permissive.png`` and ``flow_restrictive.png``.
 
     Args:
-        folder: with configuration and checkpoint.
-        trusted: see `RunFolder.load_config`.
-        episodes: number of those drawn.
-        dpi: dots per inch.
+        folder: The folder of a run, with configuration and checkpoint.
+        trusted: The packages that it may name, see `RunFolder.load_config`.
+        episodes: The number of episodes drawn.
+        dpi: Dots per inch.
     """
     config = folder.load_config(trusted)
     # A run that goes on after its figures draws the same random numbers as without them.

@@ -63,11 +63,11 @@ def flow_stages(
     outlines are those of shadows.
 
     Args:
-        snapshot: the policy in the state.
-        view: what the task shows of it; without a map its panel is left out.
-        colors: of the constraints; None chooses them by name.
-        title: above the panels.
-        detail: how fine.
+        snapshot: The policy in the state.
+        view: The view: what the task shows of it; without a map its panel is left out.
+        colors: The colors of the constraints; None chooses them by name.
+        title: The title above the panels.
+        detail: The fineness of what is drawn.
     """
     scene = Scene(Setting.of(snapshot.head).holding(snapshot, view), snapshot, detail)
     colors = dict(colors or scene.setting.colors)
@@ -109,10 +109,10 @@ def draw_base(axes: Axes, snapshot: FlowSnapshot, limits: Normalize, cells: int)
     """Draw the Gaussian base, in one or in the first two of its components.
 
     Args:
-        axes: an empty panel.
-        snapshot: the policy in a state.
-        limits: of the log-density's colors.
-        cells: of the density's grid along each axis.
+        axes: An empty panel.
+        snapshot: The policy in a state.
+        limits: The limits of the log-density's colors.
+        cells: The number of cells of the density's grid along each axis.
     """
     if snapshot.dim == 1:
         latents, log_density = base_density(snapshot, SPREAD, 4 * cells)
@@ -285,8 +285,8 @@ def _stage_title(snapshot: FlowSnapshot, index: int) -> str:
         head += (
             " (dropped here)" if not snapshot.is_active(stage.applied[-1]) else " (relaxed here)"
         )
-    told = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
-    return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {told}"
+    fault = "break a constraint" if index + 1 == len(snapshot.stages) else "outside the set so far"
+    return f"{head}\n{int(snapshot.outside(index).sum())} of {len(stage.samples)} {fault}"
 
 
 def _legend(scene: Scene, colors: Mapping[str, str]) -> list[Line2D]:

@@ -16,8 +16,8 @@ def save_sweep(runs: Sequence[SweepRun], path: Path) -> Path:
     """Draw the scores of a sweep's runs, a row for each setting, and write them as PNG.
 
     Args:
-        runs: the runs.
-        path: the file.
+        runs: The runs.
+        path: The file.
     """
     groups = over_seeds(runs)
     if not any(run.is_done for run in runs):

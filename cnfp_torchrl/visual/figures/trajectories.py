@@ -42,12 +42,12 @@ class Episode:
     """What happened to one agent, step by step.
 
     Args:
-        positions: on the map, ``(steps + 1, 2)``.
-        levels: the first of the task's series, before each step and at the end, ``(steps + 1,)``;
+        positions: The positions on the map, ``(steps + 1, 2)``.
+        levels: The first of the task's series, before each step and at the end, ``(steps + 1,)``;
             None for a task without one.
-        goals: on the map, ``(steps + 1, 2)``; None for a task without goals.
-        rewards: ``(steps,)``.
-        costs: the indicators, ``(steps, K)``; K = 0 where the environment counts nothing.
+        goals: The goals on the map, ``(steps + 1, 2)``; None for a task without goals.
+        rewards: The rewards, ``(steps,)``.
+        costs: The indicators, ``(steps, K)``; K = 0 where the environment counts nothing.
     """
 
     positions: NDArray[np.float32]
@@ -72,9 +72,9 @@ def record_episodes(
     """Run one episode for each batch element of an environment whose task has a map.
 
     Args:
-        env: with any transforms, ``(batch,)``.
-        policy: writes ``action``; draws by the exploration type in force.
-        max_steps: cut longer episodes here.
+        env: The environment, with any transforms, ``(batch,)``.
+        policy: The policy, which writes ``action``; draws by the exploration type in force.
+        max_steps: The number of steps after which episodes are cut.
     """
     view = find_task_view(env)
     rollout = env.rollout(max_steps, policy, break_when_any_done=True).cpu()
@@ -110,11 +110,11 @@ def trajectories(
     Where a violating step ends stands a cross in the constraint's color.
 
     Args:
-        view: of a task with a map.
-        episodes: one for each panel.
-        constraint_names: of the columns of the episodes' costs.
-        colors: of the constraints; None chooses them by name.
-        title: above the panels.
+        view: The view of a task with a map.
+        episodes: The episodes, one for each panel.
+        constraint_names: The names of the columns of the episodes' costs.
+        colors: The colors of the constraints; None chooses them by name.
+        title: The title above the panels.
     """
     plane = view.map
     assert plane is not None
@@ -164,7 +164,7 @@ def _scale(view: TaskView, episodes: Sequence[Episode]) -> Normalize | None:
         return None
     if view.series[0].limits is not None:
         return Normalize(*view.series[0].limits)
-    levels = np.concatenate([each.levels for each in episodes if each.levels is not None])
+    levels = np.concatenate([episode.levels for episode in episodes if episode.levels is not None])
     return Normalize(float(levels.min()), float(levels.max()))
 
 

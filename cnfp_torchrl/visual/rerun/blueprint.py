@@ -57,12 +57,12 @@ def flow_blueprint(
     what the constraints did, of the task, and of the training, with one time axis for all.
 
     Args:
-        actor: as given to `FlowStream`.
-        env: as given to `FlowStream`.
-        projections: as given to `FlowStream`.
-        training: titles of plots over training and the names of what is in them, as given to
+        actor: The actor as given to `FlowStream`.
+        env: The environment as given to `FlowStream`.
+        projections: The projections as given to `FlowStream`.
+        training: The titles of plots over training and the names of what is in them, as given to
             `RerunLogger`, such as `TRAINING_PLOTS`; None: none.
-        timeline: that is shown first.
+        timeline: The timeline that is shown first.
     """
     setting = Setting.of(flow_head(actor), env, projections)
     explanation = rrb.TextDocumentView(origin=f"/{EXPLANATION}", name="What happened in this step")

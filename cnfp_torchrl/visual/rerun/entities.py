@@ -20,7 +20,7 @@ class _Component:
     """One component of an archetype, in Arrow's format.
 
     Args:
-        archetype: with this component alone.
+        archetype: The archetype, with this component alone.
     """
 
     def __init__(self, archetype: rr.AsComponents) -> None:
@@ -61,8 +61,8 @@ def strips_of(ends: NDArray[np.int32], positions: NDArray[np.float32]) -> Logged
     """Return lines.
 
     Args:
-        ends: where each line begins and the last one ends, ``(lines + 1,)``.
-        positions: the points of all lines, ``(n, 2)``.
+        ends: The numbers where each line begins and the last one ends, ``(lines + 1,)``.
+        positions: The points of all lines, ``(n, 2)``.
     """
     return _STRIPS.holding(
         pa.ListArray.from_arrays(pa.array(ends), _vectors(positions), type=_STRIPS.format)
@@ -104,8 +104,8 @@ class Entities:
     Rerun shows the latest value at a time, so that an entity logged once stands until it changes.
 
     Args:
-        stream: where to log.
-        root: the path.
+        stream: The stream to log to.
+        root: The path.
     """
 
     def __init__(self, stream: rr.RecordingStream, root: str) -> None:
@@ -116,8 +116,8 @@ class Entities:
         """Log what never changes; such as has no positions, which would hide those of the steps.
 
         Args:
-            name: of the entity, or nothing for the root itself.
-            archetypes: of the entity.
+            name: The name of the entity, or nothing for the root itself.
+            archetypes: The archetypes of the entity.
         """
         self._stream.log(f"{self._root}/{name}".rstrip("/"), *archetypes, static=True)
 

@@ -54,12 +54,13 @@ class Follower:
     """Copies a growing file to a viewer.
 
     Args:
-        path: the file.
-        relay: the command that hands on to the viewer what it reads from its standard input.
-        command: starts the viewer; empty where it runs already.
-        addresses: where the viewer listens when it is there.
-        keeps_viewer: let the viewer's process outlive this one.
-        settled_s: a viewer that listens and has not ended by then is started.
+        path: The file.
+        relay: The command that hands on to the viewer what it reads from its standard input.
+        command: The command that starts the viewer; empty where it runs already.
+        addresses: The addresses that the viewer listens at when it is there.
+        keeps_viewer: Whether the viewer's process outlives this one.
+        settled_s: The seconds after which a viewer that listens and has not ended counts as
+            started.
 
     Raises:
         NotStarted: when the viewer ends, or does not listen in time.

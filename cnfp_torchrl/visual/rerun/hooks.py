@@ -23,8 +23,8 @@ class StreamHook:
     of all agents, as collectors do. Batches are not changed.
 
     Args:
-        stream: of the collector's policy.
-        agent: index of the agent in the flattened batch of environments.
+        stream: The stream of the collector's policy.
+        agent: The index of the agent in the flattened batch of environments.
 
     Raises:
         ValueError: when the collected batch has no such agent or no time dimension.
@@ -65,8 +65,8 @@ class StreamTransform(Transform):
     environment one agent is streamed; ``env_step`` counts its steps.
 
     Args:
-        stream: of the policy that steps the environment.
-        agent: index of the agent in the flattened batch.
+        stream: The stream of the policy that steps the environment.
+        agent: The index of the agent in the flattened batch.
     """
 
     def __init__(self, stream: FlowStream, agent: int = 0) -> None:

@@ -27,9 +27,9 @@ class RerunLogger(Logger):
     would draw it as nothing.
 
     Args:
-        exp_name: name of the file, without its ending.
-        log_dir: folder of the file ``EXP_NAME.rrd``, made if it is missing.
-        stream: log to this open stream instead and write no file; it is left open at the end.
+        exp_name: The name of the file, without its ending.
+        log_dir: The folder of the file ``EXP_NAME.rrd``, made if it is missing.
+        stream: An open stream to log to, so that no file is written; it is left open at the end.
 
     Raises:
         FileExistsError: when the file exists: nothing is overwritten.
@@ -76,9 +76,9 @@ class RerunLogger(Logger):
         """Log a number, or several of one name.
 
         Args:
-            name: slashes separate groups, as in ``loss/actor``.
-            value: what is not finite is not drawn, but reported.
-            step: of the environment; None counts the calls with this name.
+            name: The name, in which slashes separate groups, as in ``loss/actor``.
+            value: The number; what is not finite is not drawn, but reported.
+            step: The step of the environment; None counts the calls with this name.
         """
         values = np.atleast_1d(np.asarray(torch.as_tensor(value).detach().cpu(), dtype=np.float64))
         self._set_step(name, step)
@@ -92,11 +92,11 @@ class RerunLogger(Logger):
         """Log the pictures of a video, on the timeline ``frame``.
 
         Args:
-            name: of the video.
-            video: ``(videos, time, channels, height, width)`` or without the first, bytes; of
-                several videos the first is taken.
-            step: of the environment; None counts the calls with this name.
-            kwargs: such as ``fps``, for other loggers; the viewer has its own speed.
+            name: The name of the video.
+            video: The video, ``(videos, time, channels, height, width)`` or without the first,
+                bytes; of several videos the first is taken.
+            step: The step of the environment; None counts the calls with this name.
+            kwargs: Options such as ``fps``, for other loggers; the viewer has its own speed.
 
         Raises:
             ValueError: for another shape.
@@ -117,7 +117,7 @@ class RerunLogger(Logger):
         """Log hyperparameters as a text.
 
         Args:
-            cfg: a mapping, such as a Hydra configuration.
+            cfg: A mapping, such as a Hydra configuration.
         """
         text = json.dumps(_plain(cfg), indent=2, default=str)
         document = rr.TextDocument(f"```json\n{text}\n```", media_type="text/markdown")
@@ -129,10 +129,10 @@ class RerunLogger(Logger):
         """Log how often values occur.
 
         Args:
-            name: of the histogram.
-            data: values, of any shape; those that are not finite are reported and left out.
-            step: of the environment; None counts the calls with this name.
-            kwargs: passed on to `numpy.histogram`, such as ``bins``.
+            name: The name of the histogram.
+            data: The values, of any shape; those that are not finite are reported and left out.
+            step: The step of the environment; None counts the calls with this name.
+            kwargs: Options passed on to `numpy.histogram`, such as ``bins``.
         """
         values = np.asarray(torch.as_tensor(data).detach().cpu(), dtype=np.float64).reshape(-1)
         self._set_step(name, step)
@@ -150,7 +150,7 @@ class RerunLogger(Logger):
         """Wait until what was logged has left this process, for a bounded time.
 
         Args:
-            timeout: in seconds; None waits for a few.
+            timeout: The longest wait in seconds; None waits for a few.
         """
         self.experiment.flush(timeout_sec=_FLUSH_S if timeout is None else timeout)
 

@@ -49,9 +49,9 @@ def _log_axes(
     """Log the titles of the axes, below the frame and above it: Rerun's views have none.
 
     Args:
-        drawn: where to log.
-        titles: of the axis to the right and, if there is one, of that upwards.
-        positions: the upper ends of the titles.
+        drawn: The entities to log to.
+        titles: The titles of the axis to the right and, if there is one, of that upwards.
+        positions: The upper ends of the titles.
     """
     labels = [f"{arrow} {title}" for arrow, title in zip("→↑", titles, strict=False)]
     points = rr.Points2D(positions, labels=labels, colors=style.MUTED, radii=0.0, show_labels=True)
@@ -62,10 +62,10 @@ class PlanePainter:
     """Density, samples, sets and the executed action's path after a stage, in a plane.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        view: which stage, which components.
-        cells: of the density's grid along each axis.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        view: The view, of a stage and components.
+        cells: The number of cells of the density's grid along each axis.
     """
 
     def __init__(
@@ -83,20 +83,20 @@ class PlanePainter:
 
     def log(self, scene: Scene) -> None:
         """Log one step."""
-        entities_, stage, components = self._entities, self._stage, self._components
+        drawn, stage, components = self._entities, self._stage, self._components
         snapshot, samples = scene.snapshot, scene.samples(stage, components)[1:]
         # Exact flows stay inside after every stage; what is executed is looked at all the same.
         looked_at = self._is_last or not snapshot.is_safe
         outside = snapshot.outside(stage)[1:].numpy() if looked_at else np.zeros(0, dtype=bool)
         if scene.heat is not None:
-            entities_.log("density", entities.pixels(scene.heat[stage]))
+            drawn.log("density", entities.pixels(scene.heat[stage]))
         if stage > 0:
-            entities_.lines("way_from_stage_before", scene.tracks(stage, components, _TRACKS))
+            drawn.lines("way_from_stage_before", scene.tracks(stage, components, _TRACKS))
         any_outside = bool(outside.any())
-        entities_.points("samples", samples[~outside] if any_outside else samples)
-        entities_.points("samples_outside", samples[outside] if any_outside else samples[:0])
+        drawn.points("samples", samples[~outside] if any_outside else samples)
+        drawn.points("samples_outside", samples[outside] if any_outside else samples[:0])
         self._log_sets(scene)
-        entities_.path("executed", scene.path(stage, components))
+        drawn.path("executed", scene.path(stage, components))
 
     def _log_sets(self, scene: Scene) -> None:
         applied, components = scene.snapshot.stages[self._stage].applied, self._components
@@ -135,8 +135,8 @@ class PlanePainter:
             draw_order=-20,
             magnification_filter="linear",
         )
-        place = rr.Transform3D(translation=[x_low, y_low, 0], scale=cell)
-        self._entities.style("density", place, image)
+        transform = rr.Transform3D(translation=[x_low, y_low, 0], scale=cell)
+        self._entities.style("density", transform, image)
 
     def _log_styles(self, setting: Setting, color: style.Color) -> None:
         for name, archetypes in style.stage_styles(self._stage).items():
@@ -161,9 +161,9 @@ class LinePainter:
     below 0, and below them lies a bar for the interval of each constraint applied so far.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        view: which stage.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        view: The view of a stage.
     """
 
     def __init__(self, stream: rr.RecordingStream, setting: Setting, view: StageView) -> None:
@@ -227,9 +227,9 @@ class MapPainter:
     """The task's map: what stands in it, the goal, the agent with its trail and allowed moves.
 
     Args:
-        stream: where to log; what never changes is logged at once.
-        setting: that of all scenes.
-        plane: the map.
+        stream: The stream to log to; what never changes is logged at once.
+        setting: The setting of all scenes.
+        plane: The map.
     """
 
     def __init__(self, stream: rr.RecordingStream, setting: Setting, plane: Map) -> None:

@@ -39,11 +39,11 @@ class Recording:
     """An open recording: a stream into a file, and the viewer that shows it.
 
     Args:
-        stream: log to this.
-        path: the file.
-        lock: the open and locked file, which says that it still grows.
-        viewer: shows the recording, or None.
-        follower: the process that brings the file to the viewer, or None.
+        stream: The stream to log to.
+        path: The file.
+        lock: The open and locked file, which says that it still grows.
+        viewer: The viewer that shows the recording, or None.
+        follower: The process that brings the file to the viewer, or None.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ def open_recording(
     The times of logging are left out, so that the same steps give the same recording.
 
     Args:
-        path: of the file, usually ``recording.rrd``; must not exist.
-        viewer: None for the file alone.
-        recording_id: by which viewers tell recordings apart; None draws one.
-        blueprint: how viewers lay the recording out.
+        path: The path of the file, usually ``recording.rrd``; must not exist.
+        viewer: The viewer; None for the file alone.
+        recording_id: The identifier by which viewers tell recordings apart; None draws one.
+        blueprint: The layout of the recording in viewers.
 
     Raises:
         FileExistsError: when there is a file already.

@@ -28,13 +28,15 @@ class RunStream:
     """What to show of a run, and where: a recording, and a live viewer beside it.
 
     Args:
-        viewer: None for the file alone.
-        every: in training, every n-th step of the first agent.
-        episodes: how many episodes of the trained policy, each with all its steps.
-        deterministic: in these, the deterministic policy and not the stochastic one.
-        render_every: in these, how many steps lie between two pictures of the environment; 0: none.
-        samples: how many actions to draw in each step.
-        projections: pairs of action components, for actions of more than two.
+        viewer: The viewer; None for the file alone.
+        every: The interval n: in training, every n-th step of the first agent is recorded.
+        episodes: The number of episodes of the trained policy, each with all its steps.
+        deterministic: Whether the policy is the deterministic one in these, and not the stochastic
+            one.
+        render_every: The number of steps, in these, between two pictures of the environment; 0:
+            none.
+        samples: The number of actions drawn in each step.
+        projections: Pairs of action components, for actions of more than two.
 
     Raises:
         ValueError: for a number below 1.
@@ -126,8 +128,8 @@ class EpisodeStream:
     """Stream whole episodes, each on a timeline of its own.
 
     Args:
-        stream: returns a stream of every n-th step on a timeline.
-        policy: ``stochastic`` or ``deterministic``.
+        stream: A function that returns a stream of every n-th step on a timeline.
+        policy: The policy's kind, ``stochastic`` or ``deterministic``.
     """
 
     def __init__(self, stream: Callable[[int, str], FlowStream], policy: str) -> None:
@@ -148,9 +150,9 @@ class TrainingStream:
     """Stream the first agent of every batch, the log's scalars, and episodes when it is trained.
 
     Args:
-        recording: closed with this.
-        stream: of the collector's policy.
-        episodes: the stream of episodes.
+        recording: The recording, closed with this.
+        stream: The stream of the collector's policy.
+        episodes: The stream of episodes.
     """
 
     def __init__(self, recording: Recording, stream: FlowStream, episodes: EpisodeStream) -> None:
@@ -172,8 +174,8 @@ class EvaluationStream:
     """Stream whole episodes, and stay for whoever looks at them.
 
     Args:
-        recording: closed with this.
-        episodes: the stream of them.
+        recording: The recording, closed with this.
+        episodes: The stream of episodes.
     """
 
     def __init__(self, recording: Recording, episodes: EpisodeStream) -> None:

@@ -22,11 +22,11 @@ class Plot:
     """A plot over the steps of an episode.
 
     Args:
-        name: of the entity, below ``series``.
-        title: with the unit.
-        curves: colors by the curves' names.
-        limits: of the upright axis; None fits it to the curves.
-        is_apart: whether each curve is an entity of its own, which may lack values of some steps.
+        name: The name of the entity, below ``series``.
+        title: The title, with the unit.
+        curves: The colors by the curves' names.
+        limits: The limits of the upright axis; None fits it to the curves.
+        is_apart: Whether each curve is an entity of its own, which may lack values of some steps.
     """
 
     name: str
@@ -74,8 +74,8 @@ class SeriesPainter:
     """Logs the values of all plots.
 
     Args:
-        stream: where to log; names and colors are logged at once.
-        setting: with the costs' names, the constraints' colors and the task's series.
+        stream: The stream to log to; names and colors are logged at once.
+        setting: The setting, with the costs' names, the constraints' colors and the task's series.
     """
 
     def __init__(self, stream: rr.RecordingStream, setting: Setting) -> None:

@@ -52,17 +52,18 @@ class FlowStream:
     Logs from the process that it was made in, and keeps a trail of at most 1000 positions.
 
     Args:
-        recording: an open one; Rerun's own stream, or what holds it as ``stream``.
-        actor: the policy, from `make_constrained_actor` or `constrain`.
-        env: shows its task (`cnfp_torchrl.envs`) and says what the costs are called;
-            None: neither is shown.
-        projections: pairs of action components, counted from 0, a row of views for each, for
+        recording: An open recording; Rerun's own stream, or what holds it as ``stream``.
+        actor: The policy, from `make_constrained_actor` or `constrain`.
+        env: The environment, which shows its task (`cnfp_torchrl.envs`) and says what the costs are
+            called; None: neither is shown.
+        projections: Pairs of action components, counted from 0, a row of views for each, for
             actions of more than two components; None shows each component once.
-        samples: how many actions to draw in each step.
-        every: log every n-th step, the first one included; returns, costs and the trail count all.
-        cells: of the density's grid along each axis.
-        timeline: that the steps are counted on.
-        setting: what to show, as another stream's `setting`; None finds it by env and projections.
+        samples: The number of actions drawn in each step.
+        every: The interval n: every n-th step is logged, the first one included; returns, costs and
+            the trail count all.
+        cells: The number of cells of the density's grid along each axis.
+        timeline: The timeline that the steps are counted on.
+        setting: What is shown, as another stream's `setting`; None finds it by env and projections.
 
     Raises:
         ValueError: for a number below 1, a projection that is none, or a flow without density.
@@ -137,10 +138,10 @@ class FlowStream:
         """Log one step, or only count it where it is not every n-th one.
 
         Args:
-            step: of the environment, on the stream's timeline.
-            transition: of batch size ``()``: the state with its geometry, the executed action, the
-                policy's location and scale, and reward, cost and done under ``next``.
-            heading: begins the explanation, such as with the episode that the step belongs to.
+            step: The step of the environment, on the stream's timeline.
+            transition: A transition of batch size ``()``: the state with its geometry, the executed
+                action, the policy's location and scale, and reward, cost and done under ``next``.
+            heading: The beginning of the explanation, such as the episode that the step belongs to.
 
         Raises:
             ValueError: when the transition is a batch, or a number in it is not finite, which

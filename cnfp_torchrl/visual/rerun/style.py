@@ -83,7 +83,8 @@ def stage_styles(stage: int) -> Mapping[str, Sequence[rr.AsComponents]]:
     """Return the styles of what the view of a stage shows in the plane and on the line, by entity.
 
     Args:
-        stage: its index, which says how many points the executed action's path has before it.
+        stage: The stage's index, which says how many points the executed action's path has before
+            it.
     """
     lines, points = rr.LineStrips2D.from_fields, rr.Points2D.from_fields
     return {

@@ -16,6 +16,8 @@ import rerun_cli
 from cnfp_torchrl.visual.rerun.follow import Address, is_listening
 
 LOOPBACK = "127.0.0.1"
+WEB_PORT, PORT = 9090, 9876
+"""The usual ports of the web viewer's page, and of recordings."""
 
 _PATIENCE_S = 5.0
 """How long a viewer that listens may take to answer, on a machine that is busy with training."""
@@ -33,8 +35,8 @@ class Viewer(ABC):
     """A viewer, or a server for viewers, that listens at an address for a recording.
 
     Args:
-        host: where it listens.
-        port: where it listens.
+        host: The host that it listens at.
+        port: The port that it listens at.
     """
 
     stays_open: ClassVar[bool] = False
@@ -82,7 +84,7 @@ class RunningViewer(Viewer):
     """A viewer that runs already, here or behind a tunnel: start one with ``rerun``.
 
     Args:
-        url: where it listens, ``rerun+http://HOST:PORT/proxy``.
+        url: The address that it listens at, ``rerun+http://HOST:PORT/proxy``.
 
     Raises:
         SinkError: when that is no address of a viewer.
@@ -132,17 +134,17 @@ class WebViewer(Viewer):
     """Rerun's web viewer for a browser, served while the recording is open.
 
     Args:
-        web_port: of the page.
-        port: of the data that the page fetches.
-        host: the address to listen at; everybody who reaches it can look.
-        memory_limit: of the data kept for those who come later, such as ``256MiB``; the oldest are
-            dropped. The file keeps everything.
+        web_port: The port of the page.
+        port: The port of the data that the page fetches.
+        host: The address to listen at; everybody who reaches it can look.
+        memory_limit: The memory limit of the data kept for those who come later, such as
+            ``256MiB``; the oldest are dropped. The file keeps everything.
     """
 
     def __init__(
         self,
-        web_port: int = 9090,
-        port: int = 9876,
+        web_port: int = WEB_PORT,
+        port: int = PORT,
         host: str = LOOPBACK,
         memory_limit: str = "256MiB",
     ) -> None:
@@ -154,7 +156,8 @@ class WebViewer(Viewer):
     def url(self) -> str:
         """The page to open in a browser."""
         source = quote(f"rerun+http://{self.host}:{self.port}/proxy", safe="")
-        return f"http://{self.host}:{self.web_port}/?url={source}"
+        # Dark, as views and curves are meant to be seen; else the browser's own theme is taken.
+        return f"http://{self.host}:{self.web_port}/?url={source}&theme=dark"
 
     def require(self) -> None:
         if self.web_port == self.port:
@@ -181,9 +184,9 @@ class ViewerWindow(Viewer):
     """A window of its own, which stays open when the recording ends.
 
     Args:
-        memory_limit: of the window, such as ``1GiB``; the oldest data are dropped.
-        port: where it listens, on loopback; None takes a free one.
-        arguments: further ones for ``rerun``, such as ``--renderer=gl``.
+        memory_limit: The memory limit of the window, such as ``1GiB``; the oldest data are dropped.
+        port: The port that it listens at, on loopback; None takes a free one.
+        arguments: Further arguments for ``rerun``, such as ``--renderer=gl``.
     """
 
     stays_open = True
@@ -194,7 +197,7 @@ class ViewerWindow(Viewer):
         port: int | None = None,
         arguments: Sequence[str] = (),
     ) -> None:
-        super().__init__(LOOPBACK, _free_port() if port is None else port)
+        super().__init__(LOOPBACK, free_port() if port is None else port)
         self._memory_limit, self._arguments = memory_limit, list(arguments)
 
     def require(self) -> None:
@@ -236,7 +239,13 @@ def _require_free(name: str, host: str, port: int) -> None:
         ) from None
 
 
-def _free_port() -> int:
+def free_port(preferred: int = 0) -> int:
+    """Return a port of loopback that is free: the preferred one, or any."""
+    try:
+        _require_free("port", LOOPBACK, preferred)
+    except SinkError:
+        preferred = 0
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((LOOPBACK, preferred))
         return int(probe.getsockname()[1])

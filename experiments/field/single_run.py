@@ -1,6 +1,6 @@
 """Do one run and keep its record; `experiments.field.run` starts many of these.
 
-python -m experiments.field.one TASK METHOD SEED [--data FOLDER] [key=value ...]
+python -m experiments.field.single_run TASK METHOD SEED [--data FOLDER] [key=value ...]
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def train_ours(config: DictConfig) -> tuple[Act, dict[str, Any]]:
     updates = int((curve["steps"] - config.training.warmup_frames) * config.training.update_ratio)
     drawn = 2 * updates * config.replay_buffer.batch_size
     relaxed = {
-        name: sum(n for state, n in each["steps"].items() if state != "active")
-        for name, each in summary["constraints"].items()
+        name: sum(n for state, n in counts["steps"].items() if state != "active")
+        for name, counts in summary["constraints"].items()
     }
     return act, {
         **curve,
@@ -115,7 +115,7 @@ def evaluate(config: DictConfig, act: Act, *, greedy: bool) -> Outcome:
 
     result: Evaluation = evaluate_seeded(env, policy, settings, deterministic=greedy)
     return Outcome(
-        returns=[round(each, 3) for each in result.returns.tolist()],
+        returns=[round(value, 3) for value in result.returns.tolist()],
         steps=result.steps,
         violations=dict(zip(result.violations, result.costs.sum(0).long().tolist(), strict=True)),
         moved=round(moved / taken, 5),
@@ -128,7 +128,7 @@ def milliseconds(config: DictConfig, act: Act, repeats: int = 100) -> float:
     env = build_environment(config, batch_size=[1])
     env.set_seed(0)
     publishers: list[Any] = [
-        each for each in env.transform if isinstance(each, ConstraintPublisher)
+        transform for transform in env.transform if isinstance(transform, ConstraintPublisher)
     ]
     state, times = env.reset(), []
     for _ in range(repeats):
