@@ -95,9 +95,7 @@ class Metrics:
         self._next_log = state["next_log"]
         clocks = time.perf_counter(), time.process_time()
         self._started = [now - past for now, past in zip(clocks, state["seconds"], strict=True)]
-        self._before = {
-            name: ConstraintCounts(**counts) for name, counts in state["before"].items()
-        }
+        self._before = {n: ConstraintCounts(**counts) for n, counts in state["before"].items()}
         self._recent.load_state_dict(state["recent"])
         self._returns = list(state["returns"])
         self._losses.update({name: list(values) for name, values in state["losses"].items()})
