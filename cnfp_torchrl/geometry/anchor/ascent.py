@@ -14,6 +14,7 @@ The batch comes last in all tensors here: so many small problems are solved fast
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -85,7 +86,8 @@ class Ascent:
 
     def __init__(self, sets: Sequence[ConstraintSet], start: Tensor, upper: Tensor) -> None:
         self.shape, self.dim = start.shape[:-1], start.shape[-1]
-        self.count = self.shape.numel()
+        # Not shape.numel(), with which an exported program would be one for a single batch size.
+        self.count = math.prod(self.shape)
         bounds = bounds_of(sets)
         # In units of the bounds' half widths, about their middle.
         low, high = self._last(bounds.low), self._last(bounds.high)
@@ -282,7 +284,7 @@ class Ascent:
         """Return values ``(*batch, *event)`` as ``(*event, B)``, or with 1 where all are alike."""
         event = value.shape[value.ndim - events :]
         batch = value.shape[: value.ndim - events]
-        if batch.numel() > 1 and batch != self.shape:
+        if math.prod(batch) > 1 and batch != self.shape:
             value = value.expand((*self.shape, *event))
         return value.reshape(-1, *event).movedim(0, -1).contiguous()
 
