@@ -147,7 +147,7 @@ def test_bad_arguments_are_refused_by_name() -> None:
         RobotEnv("Pendulum-v1")
     env = robot_with_previous_action("Hopper-v5", [1])
     env.reset()
-    with pytest.raises(ValueError, match=r"action at index \[0, 0\]: expected finite"):
+    with pytest.raises(ValueError, match=r"action at index \[0, 0\]: expected a finite"):
         env.step(TensorDict({"action": torch.full((1, 3), torch.nan)}, [1]))
 
 

@@ -76,7 +76,7 @@ def test_the_environment_moves_and_costs_what_an_episode_does() -> None:
     assert shown["truncated"].all()
     run = episode(PROBLEM, start, nominal_control)
     torch.testing.assert_close(total, run.cost.float(), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match=r"action at index \[0, 1\]: expected finite numbers"):
+    with pytest.raises(ValueError, match=r"action at index \[0, 1\]: expected a finite number"):
         env.step(env.reset().set("action", torch.tensor([[0.0, torch.nan]]).expand(7, 2)))
 
 
