@@ -28,6 +28,7 @@ from cnfp_torchrl.configuration.trust import (
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
 from tests.entry_points import load_command
+from tests.payload import Payload
 
 PATH = Path("run/config.yaml")
 CALL = "cnfp_torchrl.training.run_folder.torch.load"
@@ -328,14 +329,6 @@ def test_every_experiment_is_read_back(
     assert set(targets(OmegaConf.to_container(read))) <= nameable()
     assert folder.load_training_config() == folder.load_settings()
     assert instantiate(read.env.base, _convert_="all")
-
-
-class Payload:
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
 
 
 COMMANDS = {

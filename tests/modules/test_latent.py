@@ -15,7 +15,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
-from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, SoftUpdate, TD3Loss
+from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss
 
 from cnfp_torchrl.modules import (
     FlowMap,
@@ -314,67 +314,6 @@ def test_noise_on_the_latent_stays_allowed_and_on_the_action_does_not(
         assert bool(good.all()), name
     assert not bool(inside(broken)["battery"].all())
     assert not bool(inside(broken)["obstacle"].all())
-
-
-class Recorder(nn.Module):
-    """A critic of actions that remembers what it was asked."""
-
-    def __init__(self, asked: list[Tensor]) -> None:
-        super().__init__()
-        self.asked = asked
-        self.network = MLP(7, 1, num_cells=[8])
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Recorder":
-        fresh = Recorder(self.asked)
-        fresh.network = copy.deepcopy(self.network, memo)
-        return fresh
-
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        self.asked.append(action.detach().clone())
-        return self.network(observation, action)
-
-
-@pytest.mark.parametrize("vectorised", [True, False])
-def test_td3_asks_its_critic_about_allowed_actions_only(
-    vectorised: bool, state: TensorDictBase, make_actor: Callable[..., Any], inside: Inside
-) -> None:
-    """With the latent for its action, TD3's target noise is added before the flow."""
-    flow = FlowMap(flow_head(make_actor()))
-    network = TensorDictModule(MLP(5, 2, num_cells=[8]), ["observation"], ["latent"])
-    actor = TensorDictSequential(network, flow)
-    asked: list[Tensor] = []
-    value: nn.Module = MLP(7, 1, num_cells=[8]) if vectorised else Recorder(asked)
-    critic = TensorDictSequential(flow, ValueOperator(value, in_keys=["observation", "action"]))
-    loss = TD3Loss(
-        actor,
-        critic,
-        bounds=(-torch.inf, torch.inf),
-        policy_noise=3.0,
-        noise_clip=10.0,
-        deactivate_vmap=not vectorised,
-    )
-    loss.set_keys(action="latent")
-    loss.make_value_estimator(gamma=0.9)
-    SoftUpdate(loss, tau=0.1)  # TorchRL warns without one
-    with torch.no_grad():
-        steps = actor(state.copy())
-    after = state.copy()
-    flags = torch.zeros(*state.shape, 1, dtype=torch.bool)
-    after.update({"reward": flags.float(), "done": flags, "terminated": flags})
-    steps["next"] = after
-    losses = loss(steps)
-    (losses["loss_actor"] + losses["loss_qvalue"]).backward()
-    for name, parameter in network.named_parameters():
-        assert parameter.grad is not None, name
-        assert bool(parameter.grad.isfinite().all()), name
-        assert bool((parameter.grad != 0).any()), name
-    if not vectorised:
-        assert len(asked) == 6  # two critics: the actor's loss, the target, the stored latent
-        for action in asked:
-            for name, good in inside(state.copy().set("action", action)).items():
-                assert bool(good.all()), name
-        # The noise has an effect.
-        assert bool((asked[2] - steps["action"]).abs().max() > 0.1)
 
 
 # Refusals

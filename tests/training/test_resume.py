@@ -24,6 +24,7 @@ from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BrokenCheckpointWarning
 from cnfp_torchrl.training.train import train
 from experiments.resume import differences
+from tests.payload import Payload
 
 from .conftest import TINY as SHORT
 
@@ -236,16 +237,6 @@ def test_a_strangers_run_is_not_trained_further(make_config: MakeConfig, tmp_pat
     folder.save_config(config)
     with pytest.raises(PermissionError, match=r"optim\._target_"):
         resumed_config(folder, make_config(), [])
-
-
-class Payload:
-    """What a stranger's state could carry: code that runs when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
 
 
 @pytest.mark.parametrize("kind", ["state", "transitions"])

@@ -22,16 +22,7 @@ from cnfp_torchrl.training.checkpoints import CheckpointError
 from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, CONFIG, SUMMARY, RunFolder
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
-
-
-class Payload:
-    """What a stranger's checkpoint could carry: code that runs when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
+from tests.payload import Payload
 
 
 @pytest.mark.parametrize("held", [CONFIG, CHECKPOINT, SUMMARY])
