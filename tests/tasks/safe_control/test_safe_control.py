@@ -4,13 +4,12 @@ from functools import partial
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.audit import AuditSettings, audit
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.tasks.safe_control import (
     Problem,
@@ -57,8 +56,7 @@ def environment(
     agents: int, flow: str = "exact"
 ) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
     """Return the shipped environment, with anchors, and an actor of a flow."""
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", ["env=safe_control", f"flow={flow}"])
+    config = compose_config("env=safe_control", f"flow={flow}")
     env = build_environment(config, batch_size=[agents], with_anchor=True)
     env.set_seed(0)
     return env, build_actor(config, env)

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.figures import draw_run_figures
@@ -44,8 +43,7 @@ def make_run(tmp_path: Path) -> RunFactory:
 
 
 def configure(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose("train", overrides=["+env.base.max_steps=20", *overrides])
+    return compose_config("+env.base.max_steps=20", *overrides)
 
 
 def pendulum() -> DictConfig:
