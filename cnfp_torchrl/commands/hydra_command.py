@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from cnfp_torchrl.commands.paths import quoted_paths
 from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, errors_in_a_sentence, write_error
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import config_directory, refuse_unknown_settings
 
 R = TypeVar("R")
 
@@ -40,6 +40,7 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[
                 return _run_of_sweep(function, config)
             # Not left to Hydra, which prints the overrides before the cause.
             with errors_in_a_sentence():
+                refuse_unknown_settings(config)
                 return function(config)
 
         application = hydra.main(
@@ -65,6 +66,7 @@ def is_sweep() -> bool:
 def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
     """Call a function, and write at once why it fails: Hydra tells of one failure, at the end."""
     try:
+        refuse_unknown_settings(config)
         return function(config)
     except Exception as error:
         folder = Path(HydraConfig.get().runtime.output_dir).name
