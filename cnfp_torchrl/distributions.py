@@ -12,6 +12,7 @@ from torch.distributions.utils import _standard_normal
 
 from cnfp_torchrl.bijectors import Bijector, Stages, has_latent, well_inside
 from cnfp_torchrl.geometry import broadcast_shape
+from cnfp_torchrl.keys import refuse_non_finite
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
@@ -187,11 +188,7 @@ class ConstrainedFlow(TransformedDistribution):
         if not 0 < depth < 1:
             raise ValueError(f"depth: expected a share between 0 and 1, given {depth}")
         self._refuse_other_shapes(value)
-        if not bool(value.isfinite().all()):
-            index = (~value.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
-                f"value at index {index}: expected a finite number, given {value[tuple(index)]}"
-            )
+        refuse_non_finite("value", value)
         action = well_inside(self.bijector, value, depth)
         moved = torch.linalg.vector_norm(value - action, dim=-1)
         return NearestLogProb(self.log_prob(action), action, moved)

@@ -117,6 +117,29 @@ def require(tensordict: TensorDictBase, key: NestedKey, remedy: str) -> Tensor:
     return value
 
 
+def refuse_non_finite(
+    name: str, value: Tensor, remedy: str = "", error: type[ValueError] = ValueError
+) -> None:
+    """Refuse numbers that are not finite, naming the first one.
+
+    Args:
+        name: The name of the numbers, for the message.
+        value: The numbers, of any shape.
+        remedy: An instruction for whoever finds such a number.
+        error: The type of the error.
+
+    Raises:
+        ValueError: when one is infinite or NaN.
+    """
+    finite = value.isfinite()
+    if not bool(finite.all()):
+        index = (~finite).nonzero()[0].tolist()
+        raise error(
+            f"{name} at index {index}: expected a finite number, given "
+            f"{value[tuple(index)].item()}{remedy and f'; {remedy}'}"
+        )
+
+
 def refuse_string(argument: str, given: object) -> None:
     """Refuse a string instead of a sequence of keys or names: it would be split into letters.
 

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor, nn
@@ -32,7 +31,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import constraint_bijectors, constraint_names
 from cnfp_torchrl.modules import flow_head, make_constrained_actor
 from cnfp_torchrl.training.agent import build_actor, build_environment
@@ -186,8 +185,7 @@ def run(
 @functools.cache
 def default_config(flow: str) -> DictConfig:
     """Return the default configuration of training with a flow."""
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose("train", [f"flow={flow}"])
+    return compose_config(f"flow={flow}")
 
 
 def build(

@@ -30,10 +30,9 @@ from typing import Any
 
 import psutil
 import torch
-from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
 from cnfp_torchrl.training.run_state import RunState
 from cnfp_torchrl.training.train import train
@@ -164,8 +163,7 @@ def _children_seconds() -> float:
 
 def cost(root: Path, steps: int) -> list[list[str]]:
     """Return the time of a run of the default configuration, and of saving its states."""
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", [f"collector.total_frames={steps}", "evaluation.episodes=2"])
+    config = compose_config(f"collector.total_frames={steps}", "evaluation.episodes=2")
     save, spent = RunState.save, [0.0, 0.0, 0.0]
 
     def timed(self: RunState, frames: int) -> None:

@@ -19,11 +19,10 @@ from pathlib import Path
 
 import psutil
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from tqdm import tqdm
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.keys import CONSTRAINT_STATES
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.constraint_counts import ConstraintTally
@@ -56,8 +55,7 @@ def main() -> None:
         f"replay_buffer.storage.max_size={max(options.steps // 100, options.agents)}",
         f"flow={options.flow}",
     ]
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides)
+    config = compose_config(*overrides)
     torch.manual_seed(options.seed)
     torch.set_num_threads(config.threads)
     env = build_environment(config)

@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.errors import MissingConfigException
-from omegaconf import DictConfig
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config, config_directory
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 
@@ -19,11 +17,6 @@ TINY = [
     "+env.base.max_steps=5",
     "collector.frames_per_batch=16",
 ]
-
-
-def composed(*overrides: str, name: str = "train") -> DictConfig:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose(name, overrides=list(overrides))
 
 
 # What belongs to another algorithm than the default runs as a part of it.
@@ -45,25 +38,25 @@ OPTIONS = sorted(
 def test_every_option_runs(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     group, _, name = option.rpartition("/")
-    config = composed("figures=none", f"{group}={name}", *TINY)
+    config = compose_config("figures=none", f"{group}={name}", *TINY)
     summary = train(config, RunFolder.create(tmp_path / "run"))
     assert summary["steps"] == 64
 
 
 @pytest.mark.parametrize("name", ["train", "evaluate", "audit"])
 def test_every_main_configuration_composes(name: str) -> None:
-    assert composed(name=name)
+    assert compose_config(name=name)
 
 
 @pytest.mark.parametrize("loss", ["sac", "sac_lagrangian"])
 def test_the_target_entropy_is_the_task_s_or_that_of_the_action_bounds(loss: str) -> None:
-    assert composed(f"loss={loss}", "env.target_entropy=-3.0").loss.target_entropy == -3
-    assert composed(f"loss={loss}", "~env.target_entropy").loss.target_entropy == "auto"
+    assert compose_config(f"loss={loss}", "env.target_entropy=-3.0").loss.target_entropy == -3
+    assert compose_config(f"loss={loss}", "~env.target_entropy").loss.target_entropy == "auto"
 
 
 def test_an_unknown_experiment_is_refused_with_the_choices() -> None:
     with pytest.raises(MissingConfigException, match=r"(?s)lagrangain.*lagrangian"):
-        composed("experiment=lagrangain")
+        compose_config("experiment=lagrangain")
 
 
 def test_an_experiment_overrides_the_main_file_and_the_command_line_overrides_it(
@@ -74,5 +67,5 @@ def test_an_experiment_overrides_the_main_file_and_the_command_line_overrides_it
         "# @package _global_\nseed: 7\ntraining:\n  log_interval: 70\n"
     )
     own = ["experiment=mine", f"hydra.searchpath=[file://{tmp_path}]"]
-    config = composed(*own, "training.log_interval=80")
+    config = compose_config(*own, "training.log_interval=80")
     assert (config.seed, config.training.log_interval) == (7, 80)

@@ -20,6 +20,7 @@ from cnfp_torchrl.keys import (
     RESERVED_NAMES,
     SAFE_ACTION_KEY,
     field_key,
+    refuse_non_finite,
     refuse_string,
 )
 from cnfp_torchrl.modules import ConstraintBijector, ConstraintPublisher, action_bounds
@@ -429,14 +430,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     def _refuse_what_is_not_finite(self, states: TensorDictBase) -> None:
         for key in self.in_keys:
-            value = states.get(key)
-            finite = value.isfinite()
-            if not bool(finite.all()):
-                index = (~finite).nonzero()[0].tolist()
-                raise GeometryError(
-                    f"constraint '{self.name}', key {key!r} at index {index}: expected a finite "
-                    f"number, given {value[tuple(index)].item()}"
-                )
+            name = f"constraint '{self.name}', key {key!r}"
+            refuse_non_finite(name, states.get(key), error=GeometryError)
 
 
 class Check(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
-from cnfp_torchrl.keys import require
+from cnfp_torchrl.keys import refuse_non_finite, require
 from cnfp_torchrl.modules.flow_module import ConstrainedFlowModule
 from cnfp_torchrl.modules.latent import FlowMap
 
@@ -44,12 +44,7 @@ class FreeActionMap(FlowMap):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the allowed action ``(*batch, d)`` in the place of the free one."""
         free = require(tensordict, self.latent_key, "choose an action before the step")
-        if not bool(free.isfinite().all()):
-            index = (~free.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
-                f"{self.latent_key} at index {index}: expected a finite number, given "
-                f"{free[tuple(index)].item()}; look for the agent's first NaN"
-            )
+        refuse_non_finite(str(self.latent_key), free, "look for the agent's first NaN")
         if not self.unbounded:
             largest = 1 - torch.finfo(free.dtype).eps
             tensordict.set(self.latent_key, free.clamp(-largest, largest).atanh())

@@ -33,12 +33,11 @@ from statistics import median, quantiles
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.tasks.point_nav import POINT_NAV_ID
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -56,10 +55,7 @@ Rounds = dict[str, list[float]]
 
 def composed(flow: str, width: int, *overrides: str) -> DictConfig:
     """Return the configuration of a training run."""
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose(
-            "train", overrides=[f"flow={flow}", f"network.hidden=[{width},{width}]", *overrides]
-        )
+    return compose_config(f"flow={flow}", f"network.hidden=[{width},{width}]", *overrides)
 
 
 def our_update(flow: str, width: int, *, compiled: bool = False) -> Callable[[], Any]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 
 FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
@@ -104,8 +103,7 @@ class Job:
         if flow == "projection":
             # Of Dykstra's algorithm, for hopper_mixed alone; the other sets have closed forms.
             own.append(f"+flow.rounds={ROUNDS}")
-        with initialize_config_dir(str(config_directory()), version_base="1.3"):
-            return compose("train", [*own, *SETTINGS, *overrides])
+        return compose_config(*own, *SETTINGS, *overrides)
 
 
 def all_jobs(tasks: tuple[str, ...], methods: tuple[str, ...], seeds: tuple[int, ...]) -> list[Job]:

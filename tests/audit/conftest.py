@@ -1,5 +1,5 @@
 """Tiny runs of the real trainer."""
 
-from tests.training.conftest import make_config, tiny_run
+from tests.training.conftest import tiny_run
 
-__all__ = ["make_config", "tiny_run"]
+__all__ = ["tiny_run"]

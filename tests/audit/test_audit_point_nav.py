@@ -2,23 +2,22 @@
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
 from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
 from cnfp_torchrl.commands.audit import FLAWS_FOUND, audit_configured, main
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.figures.audit import audit_figure, save_audit
+from tests.training.conftest import TinyRun
 
 ORDER = ["battery", "obstacle"]
 QUICK = ["batch=256", "audit.states=32", "audit.actions=16", "audit.steps=20"]
@@ -39,8 +38,8 @@ def found(report: AuditReport, source: str, name: str, kind: str) -> Any:
     return report.as_dict()["sources"][source][name][kind]
 
 
-def test_the_shipped_geometry_passes(make_config: Callable[..., DictConfig]) -> None:
-    report = audit_configured(make_config(*QUICK, name="audit"))
+def test_the_shipped_geometry_passes() -> None:
+    report = audit_configured(compose_config(*QUICK, name="audit"))
     assert report.flaws == []
     assert list(report.sources) == ["rollouts", "uniform"]
     for source in report.sources:
@@ -149,12 +148,9 @@ def test_the_figure_shows_the_worst_states(tmp_path: Path) -> None:
     assert path.stat().st_size > 20_000
 
 
-def test_a_trained_run_is_audited(
-    make_config: Callable[..., DictConfig],
-    tiny_run: Callable[..., tuple[RunFolder, dict[str, Any]]],
-) -> None:
+def test_a_trained_run_is_audited(tiny_run: TinyRun) -> None:
     folder, _ = tiny_run("flow=radial", "env.order=[obstacle,battery]")
-    report = audit_configured(make_config(*QUICK, f"run={folder.path}", name="audit"))
+    report = audit_configured(compose_config(*QUICK, f"run={folder.path}", name="audit"))
     assert report.order == ("obstacle", "battery")
     assert report.subject["flow"] == "RadialFlow"
     assert report.subject["policy"] == "actor"
@@ -174,16 +170,14 @@ def test_a_trained_run_is_audited(
         ("run=absent", "lacks"),
     ],
 )
-def test_wrong_settings_are_explained(
-    make_config: Callable[..., DictConfig], override: str, message: str
-) -> None:
+def test_wrong_settings_are_explained(override: str, message: str) -> None:
     with pytest.raises(Exception, match=message):
-        audit_configured(make_config(override, name="audit"))
+        audit_configured(compose_config(override, name="audit"))
 
 
-def test_an_unknown_environment_is_explained(make_config: Callable[..., DictConfig]) -> None:
+def test_an_unknown_environment_is_explained() -> None:
     with pytest.raises(Exception, match=r"(?s)nonsense.*point_nav"):
-        make_config("env=nonsense", name="audit")
+        compose_config("env=nonsense", name="audit")
 
 
 def test_the_command_exits_with_3_where_a_chain_of_squashes_escapes(

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from cnfp_torchrl.commands.explain import explain_run, main
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.episodes import record_episode
 from cnfp_torchrl.training.run_folder import RunFolder
@@ -32,8 +31,7 @@ def make_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolde
     def make(*overrides: str) -> RunFolder:
         if overrides not in made:
             folder = RunFolder.create(tmp_path_factory.mktemp("run"))
-            with initialize_config_dir(str(config_directory()), version_base="1.3"):
-                train(compose("train", overrides=[*TINY, *overrides]), folder)
+            train(compose_config(*TINY, *overrides), folder)
             made[overrides] = folder
         return made[overrides]
 

@@ -4,28 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from cnfp_torchrl.commands.export import main
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
-
-TINY = [
-    "collector.total_frames=64",
-    "training.warmup_frames=64",
-    "training.update_ratio=0.05",
-    "evaluation.episodes=2",
-    "+env.base.max_steps=8",
-    "logger=none",
-]
+from tests.training.conftest import TINY
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = RunFolder.create(tmp_path_factory.mktemp("run"))
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        train(compose("train", overrides=TINY), folder)
+    train(compose_config(*TINY), folder)
     return folder.path
 
 

@@ -5,12 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from cnfp_torchrl.commands.refusals import errors_in_a_sentence
-from cnfp_torchrl.configuration import config_directory, settings
+from cnfp_torchrl.configuration import compose_config, settings
 from cnfp_torchrl.modules.constraint_bijector import in_order
 from cnfp_torchrl.training.run_folder import RunFolder
 
@@ -67,8 +66,7 @@ def test_of_an_unknown_setting_those_that_are_there_are_told(
     override: str, named: str, capsys: Capture
 ) -> None:
     def composed() -> None:
-        with initialize_config_dir(str(config_directory()), version_base="1.3"):
-            compose("train", [override])
+        compose_config(override)
 
     text = written(composed, capsys)
     assert re.search(named, text)

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 
-from cnfp_torchrl.configuration import config_directory, require_settings
+from cnfp_torchrl.configuration import compose_config, require_settings
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
@@ -59,9 +57,7 @@ CASES = [
 
 
 @pytest.fixture
-def refusal(
-    make_config: Callable[..., DictConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., str]:
+def refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """Return what training says of overrides, before any step and any file."""
 
     def no_step(*_: Any) -> None:
@@ -72,7 +68,7 @@ def refusal(
     def refuse(*overrides: str) -> str:
         folder = RunFolder.create(tmp_path / "run")
         with pytest.raises(Exception, match="expected") as refused:
-            train(make_config(*overrides), folder)
+            train(compose_config(*overrides), folder)
         assert not list(folder.path.iterdir())
         return str(refused.value)
 
@@ -94,10 +90,8 @@ def test_a_run_must_hold_a_batch_and_its_warm_up(refusal: Callable[..., str]) ->
     assert "collector.frames_per_batch: expected at most collector.total_frames = 8" in said
 
 
-def test_settings_of_other_libraries_own_options_are_left_to_them(
-    make_config: Callable[..., DictConfig], tmp_path: Path
-) -> None:
-    config = make_config(
+def test_settings_of_other_libraries_own_options_are_left_to_them(tmp_path: Path) -> None:
+    config = compose_config(
         "optim._target_=torch.optim.RMSprop",
         "~optim.fused",
         "+optim.momentum=0.5",
@@ -114,9 +108,10 @@ def test_settings_of_other_libraries_own_options_are_left_to_them(
 
 @pytest.mark.parametrize(("given", "read"), [("1e4", 10_000), ("2.0", 2), ("24000", 24_000)])
 def test_a_whole_number_may_have_an_exponent(
-    given: str, read: int, make_config: Callable[..., DictConfig]
+    given: str,
+    read: int,
 ) -> None:
-    config = make_config(f"collector.total_frames={given}")
+    config = compose_config(f"collector.total_frames={given}")
     require_settings(config)
     assert config.collector.total_frames == read
     assert isinstance(config.collector.total_frames, int)
@@ -124,15 +119,14 @@ def test_a_whole_number_may_have_an_exponent(
 
 
 @pytest.mark.parametrize("given", ["1.5", "-1e3", "0.0", "nan"])
-def test_no_other_number_is_whole(given: str, make_config: Callable[..., DictConfig]) -> None:
+def test_no_other_number_is_whole(given: str) -> None:
     with pytest.raises(ValueError, match=r"collector\.total_frames: expected a whole number >= 1"):
-        require_settings(make_config(f"collector.total_frames={given}"))
+        require_settings(compose_config(f"collector.total_frames={given}"))
 
 
 def test_a_task_states_discount_and_target_entropy_unless_they_are_given() -> None:
     def losses(*overrides: str) -> tuple[Any, Any]:
-        with initialize_config_dir(str(config_directory()), version_base="1.3"):
-            loss = compose("train", overrides=list(overrides)).loss
+        loss = compose_config(*overrides).loss
         return loss.gamma, loss.target_entropy
 
     assert losses() == (0.95, -4.0)

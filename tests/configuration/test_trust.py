@@ -4,7 +4,7 @@ import inspect
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -15,8 +15,9 @@ import pytest
 import torch
 import yaml
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.configuration.trust import (
     BUILT,
     FOREIGN,
@@ -28,6 +29,7 @@ from cnfp_torchrl.configuration.trust import (
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
 from tests.entry_points import load_command
+from tests.payload import Payload
 
 PATH = Path("run/config.yaml")
 CALL = "cnfp_torchrl.training.run_folder.torch.load"
@@ -255,11 +257,9 @@ def test_a_strangers_run_is_not_trained_further(kind: str, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "choice", ["logger=wandb", "visual=connect", "visual=serve", "algorithm=ppo"]
 )
-def test_whatever_is_shipped_can_be_trained_further(
-    choice: str, make_config: Callable[..., DictConfig], tmp_path: Path
-) -> None:
+def test_whatever_is_shipped_can_be_trained_further(choice: str, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    folder.save_config(make_config(choice))
+    folder.save_config(compose_config(choice))
     assert folder.load_training_config() == folder.load_settings()
 
 
@@ -315,10 +315,8 @@ EXPERIMENTS = sorted(
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_is_read_back(
-    experiment: str, make_config: Callable[..., DictConfig], tmp_path: Path
-) -> None:
-    config = make_config(f"experiment={experiment}")
+def test_every_experiment_is_read_back(experiment: str, tmp_path: Path) -> None:
+    config = compose_config(f"experiment={experiment}")
     folder = RunFolder(tmp_path)
     folder.save_config(config)
     assert folder.load_settings() == OmegaConf.to_container(config, resolve=True)
@@ -330,14 +328,6 @@ def test_every_experiment_is_read_back(
     assert instantiate(read.env.base, _convert_="all")
 
 
-class Payload:
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
-
-
 COMMANDS = {
     "cnfp-evaluate": ["run={run}", "evaluation.episodes=2", "hydra.run.dir={place}"],
     "cnfp-audit": ["run={run}", "batch=2", "hydra.run.dir={place}"],
@@ -346,9 +336,9 @@ COMMANDS = {
 
 
 @pytest.fixture
-def evil_run(make_config: Callable[..., DictConfig], tmp_path: Path) -> Path:
+def evil_run(tmp_path: Path) -> Path:
     """A whole run whose environment is a file that runs code when it is loaded."""
-    config = make_config()
+    config = compose_config()
     folder = RunFolder.create(tmp_path / "run")
     folder.save_config(config)
     folder.save_checkpoint(actor=build_actor(config, build_environment(config)))

@@ -85,9 +85,3 @@ def test_the_lines_are_counted() -> None:
     ]
     lines = [line for body in needed for line in body.splitlines() if line]
     assert f"takes {len(lines)} lines of Python and YAML" in " ".join(DOCUMENT.read_text().split())
-
-
-def test_links_lead_somewhere() -> None:
-    links = re.findall(r"\]\((?!http)([^)#]+)", DOCUMENT.read_text())
-    assert links
-    assert not [link for link in links if not (DOCUMENT.parent / link).exists()]

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from torchrl.envs import Compose, GymEnv, RewardSum, TransformedEnv, check_env_specs
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import RewardPenalty
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.agent import build_environment
@@ -72,8 +71,7 @@ def test_an_environment_without_costs_is_refused() -> None:
 
 
 def penalised(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose("train", overrides=["experiment=penalty", *overrides])
+    return compose_config("experiment=penalty", *overrides)
 
 
 def test_only_training_is_penalised() -> None:
@@ -89,8 +87,7 @@ def test_only_training_is_penalised() -> None:
 
 @pytest.mark.parametrize(("number", "paid"), [("0", None), ("0.0", None), ("7", 7.0)])
 def test_a_number_is_a_penalty_too_and_zero_is_none(number: str, paid: float | None) -> None:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=[f"env.penalty={number}"])
+    config = compose_config(f"env.penalty={number}")
     env = build_environment(config, batch_size=[2], with_penalty=True)
     penalties = [
         transform.penalty for transform in env.transform if isinstance(transform, RewardPenalty)

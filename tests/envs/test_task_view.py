@@ -6,7 +6,6 @@ from functools import partial
 import gymnasium
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
-from hydra import compose, initialize_config_dir
 from tensordict import TensorDict
 from torchrl.envs import (
     Compose,
@@ -20,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs.task_view import Map, Series, ShowTask, TaskView, find_task_view
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.agent import build_environment
@@ -95,8 +94,7 @@ def test_what_is_no_view_is_refused(given: object) -> None:
 def test_a_configuration_s_view_takes_the_place_of_the_environment_s(
     overrides: list[str], found: str
 ) -> None:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides)
+    config = compose_config(*overrides)
     assert type(find_task_view(build_environment(config))).__name__ == found
 
 

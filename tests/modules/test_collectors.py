@@ -1,7 +1,6 @@
 """Constrained actors in TorchRL's collectors, whose weights are updated on the way."""
 
 import pickle
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
@@ -20,8 +18,7 @@ from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import WarmUpPolicy, guarded, make_constrained_actor, split_at_latent
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.networks import gaussian_network
-
-MakeActor = Callable[..., Any]
+from tests.modules.point_nav import make_actor, make_network
 
 AGENTS, STEPS = 8, 5
 
@@ -45,7 +42,7 @@ def assert_acted_by(actor: Any, batch: TensorDictBase) -> None:
     torch.testing.assert_close(batch["action_log_prob"][clear], scored[clear], rtol=0.02, atol=0.02)
 
 
-def test_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
+def test_collector(env: TransformedEnv) -> None:
     actor = make_actor(return_log_prob=True)
     collector = Collector(
         env,
@@ -113,27 +110,25 @@ WRAPPED = {
 
 
 @pytest.mark.parametrize("wrapped", WRAPPED.values(), ids=WRAPPED)
-def test_actor_of_other_bounds_is_refused(
-    env: TransformedEnv, network: nn.Module, wrapped: MakeActor
-) -> None:
+def test_actor_of_other_bounds_is_refused(env: TransformedEnv, wrapped: Any) -> None:
     actor = make_constrained_actor(
-        network, bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS, flow="gauge"
+        make_network(), bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS, flow="gauge"
     )
     with pytest.raises(ValueError, match=r"actor: expected the environment's action bounds"):
         _collect(env, wrapped(actor))
 
 
-def test_actor_of_other_bounds_follows_one_that_fits(
-    env: TransformedEnv, make_actor: MakeActor, network: nn.Module
-) -> None:
+def test_actor_of_other_bounds_follows_one_that_fits(env: TransformedEnv) -> None:
     next(iter(_collect(env, make_actor())))
     pickle.loads(pickle.dumps(env.transform[-1].clone()))
-    actor = make_constrained_actor(network, bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS)
+    actor = make_constrained_actor(
+        make_network(), bijectors=constraint_bijectors(env), spec=OTHER_BOUNDS
+    )
     with pytest.raises(ValueError, match=r"actor: expected the environment's action bounds"):
         _collect(env, actor)
 
 
-def test_exploration_behind_the_flow_is_refused(env: TransformedEnv, make_actor: MakeActor) -> None:
+def test_exploration_behind_the_flow_is_refused(env: TransformedEnv) -> None:
     policy = TensorDictSequential(make_actor(), AdditiveGaussianModule(Bounded(-1.0, 1.0, (2,))))
     with pytest.raises(TypeError, match="no AdditiveGaussianModule on constrained actions"):
         _collect(env, policy)

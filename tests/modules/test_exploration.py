@@ -1,7 +1,6 @@
 """Exploration and repeated actions of TorchRL, which know no constraints, are refused."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -26,8 +25,8 @@ from cnfp_torchrl.modules import (
     split_at_latent,
 )
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from tests.modules.point_nav import make_actor, make_tanh_actor
 
-MakeActor = Callable[..., Any]
 SPEC = Bounded(-1.0, 1.0, (2,))
 NOISES = [
     lambda **options: AdditiveGaussianModule(SPEC, **options),
@@ -42,7 +41,7 @@ NOISES = [
     [refuse_exploration, guarded, flow_head, split_at_latent, lambda p: constrain(p, flow="gauge")],
 )
 def test_noise_on_constrained_actions(
-    make_actor: MakeActor, noise: MakeActor, use: Callable[..., object]
+    noise: Callable[..., nn.Module], use: Callable[..., object]
 ) -> None:
     module = noise()
     policy = TensorDictSequential(make_actor(), module)
@@ -51,9 +50,7 @@ def test_noise_on_constrained_actions(
 
 
 @pytest.mark.parametrize("noise", NOISES)
-def test_noise_on_the_latent_may_stay(
-    make_actor: MakeActor, network: nn.Module, noise: MakeActor
-) -> None:
+def test_noise_on_the_latent_may_stay(noise: Callable[..., nn.Module]) -> None:
     latent = TensorDictModule(nn.Linear(5, 2), ["observation"], ["latent"])
     flow = FlowMap(flow_head(make_actor()))
     refuse_exploration(TensorDictSequential(latent, noise(action_key="latent"), flow))
@@ -79,9 +76,7 @@ def test_repeated_actions_inside_the_constrained_environment_may_stay() -> None:
     constrain_env(inner, BatteryGeometry(), ObstacleGeometry()).reset()
 
 
-def test_a_guard_knows_the_bounds_of_its_environment(
-    make_tanh_actor: MakeActor, env: TransformedEnv, make_actor: MakeActor
-) -> None:
+def test_a_guard_knows_the_bounds_of_its_environment(env: TransformedEnv) -> None:
     guarded(make_actor(), env)
     half = {"spec": Bounded(-0.5, 0.5, (2,)), "distribution_kwargs": {"low": -0.5, "high": 0.5}}
     narrow = make_tanh_actor(**half, distribution_class=TanhNormal)

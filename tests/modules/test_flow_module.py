@@ -38,6 +38,7 @@ from cnfp_torchrl.modules import (
     make_constrained_actor,
     with_reference_entropy,
 )
+from tests.modules.point_nav import inside, make_actor
 
 FLOWS = ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
 NAMES = [*FLOWS[:5], "squash", "projection", "unconstrained"]
@@ -49,9 +50,6 @@ EXPLORATION_TYPES = [
     ExplorationType.MODE,
     ExplorationType.MEAN,
 ]
-
-Inside = Callable[[TensorDictBase], dict[str, Tensor]]
-MakeActor = Callable[..., nn.Module]
 
 
 class Latent(nn.Module):
@@ -99,9 +97,7 @@ ANCHOR_ENTRIES = {"active", "relaxation", "row_relaxation", "anchor"}
         ("unconstrained", set()),
     ],
 )
-def test_in_keys_are_what_the_flow_needs(
-    make_actor: MakeActor, state: TensorDictBase, flow: str, reads: set[str]
-) -> None:
+def test_in_keys_are_what_the_flow_needs(state: TensorDictBase, flow: str, reads: set[str]) -> None:
     actor = make_actor(flow=flow)
     geometry = [key for key in actor.in_keys if key[0] == "constraints"]
     assert {key[-1] for key in geometry} == reads
@@ -111,9 +107,7 @@ def test_in_keys_are_what_the_flow_needs(
 
 
 @pytest.mark.parametrize("flow", ["exact", "radial", "squash"])
-def test_each_missing_entry_is_named(
-    make_actor: MakeActor, state: TensorDictBase, flow: str
-) -> None:
+def test_each_missing_entry_is_named(state: TensorDictBase, flow: str) -> None:
     actor = make_actor(flow=flow)
     for key in actor.in_keys[1:]:
         remedy = "ConstraintAnchor" if key[-1] in ANCHOR_ENTRIES else key[1]
@@ -137,15 +131,13 @@ def test_each_missing_entry_is_named(
     ],
     ids=[*NAMES, "object"],
 )
-def test_flows_by_name_and_as_objects(
-    make_actor: MakeActor, state: TensorDictBase, flow: Flow | str, kind: type
-) -> None:
+def test_flows_by_name_and_as_objects(state: TensorDictBase, flow: Flow | str, kind: type) -> None:
     head = flow_head(make_actor(flow=flow))
     assert type(head.get_bijector(state)) is kind
     assert head.flow is flow or isinstance(flow, str)
 
 
-def test_an_unknown_flow_lists_the_choices(make_actor: MakeActor) -> None:
+def test_an_unknown_flow_lists_the_choices() -> None:
     message = re.escape(f"flow: expected one of {NAMES} or a Flow, given 'gage'")
     with pytest.raises(ValueError, match=message):
         make_actor(flow="gage")
@@ -170,12 +162,7 @@ def test_the_projection_needs_rounds(rounds: int) -> None:
 @pytest.mark.parametrize("latent", LATENTS.values(), ids=LATENTS)
 @pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_exact_flows_stay_inside_whatever_the_network(
-    make_actor: MakeActor,
-    state: TensorDictBase,
-    inside: Inside,
-    flow: str,
-    latent: Latent,
-    exploration: ExplorationType,
+    state: TensorDictBase, flow: str, latent: Latent, exploration: ExplorationType
 ) -> None:
     actor = make_actor(latent, flow=flow)
     many = state.expand(500, *state.shape).clone()
@@ -194,12 +181,7 @@ def test_exact_flows_stay_inside_whatever_the_network(
     ],
 )
 def test_the_other_flows_keep_what_they_promise_and_no_more(
-    make_actor: MakeActor,
-    state: TensorDictBase,
-    inside: Inside,
-    flow: str,
-    held: str,
-    broken: str,
+    state: TensorDictBase, flow: str, held: str, broken: str
 ) -> None:
     many = state.expand(500, *state.shape).clone()
     results = inside(make_actor(LATENTS["of a new network"], flow=flow)(many))
@@ -208,9 +190,7 @@ def test_the_other_flows_keep_what_they_promise_and_no_more(
 
 
 @pytest.mark.parametrize("flow", SAFE_FLOWS)
-def test_a_constraint_that_cannot_hold_leaves_the_others(
-    env: TransformedEnv, make_actor: MakeActor, inside: Inside, flow: str
-) -> None:
+def test_a_constraint_that_cannot_hold_leaves_the_others(env: TransformedEnv, flow: str) -> None:
     # Inside the rectangle; the charge suffices for a part of the actions.
     state = env.reset(position=(0.0, 0.0), battery=28 + torch.arange(8) % 4)
     assert not state["constraints", "obstacle", "active"].any()
@@ -224,9 +204,7 @@ def test_a_constraint_that_cannot_hold_leaves_the_others(
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_stages_have_names_and_end_in_the_action(
-    make_actor: MakeActor, state: TensorDictBase, flow: str
-) -> None:
+def test_stages_have_names_and_end_in_the_action(state: TensorDictBase, flow: str) -> None:
     for order in (["battery", "obstacle"], ["obstacle", "battery"]):
         head = flow_head(make_actor(flow=flow, order=order))
         expected = {"squash": order, "unconstrained": ["bounds"]}.get(flow, ["bounds", *order])
@@ -240,9 +218,7 @@ def test_stages_have_names_and_end_in_the_action(
         torch.testing.assert_close(stages.log_dets[-1], log_det)
 
 
-def test_the_stage_of_a_constraint_is_inside_its_set(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_the_stage_of_a_constraint_is_inside_its_set(state: TensorDictBase) -> None:
     for order in (["battery", "obstacle"], ["obstacle", "battery"]):
         head = flow_head(make_actor(order=order))
         bijector = head.get_bijector(state.expand(500, *state.shape))
@@ -251,9 +227,7 @@ def test_the_stage_of_a_constraint_is_inside_its_set(
             assert constraint_set.contains(actions[stage:]).all()
 
 
-def test_random_acts_on_noise_and_not_on_the_network(
-    make_actor: MakeActor, state: TensorDictBase, inside: Inside
-) -> None:
+def test_random_acts_on_noise_and_not_on_the_network(state: TensorDictBase) -> None:
     head = flow_head(make_actor(LATENTS["saturated"], return_log_prob=True))
     many = state.expand(500, *state.shape).clone()
     torch.manual_seed(1)
@@ -278,9 +252,7 @@ def test_random_acts_on_noise_and_not_on_the_network(
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_the_log_prob_written_is_that_of_the_action(
-    make_actor: MakeActor, state: TensorDictBase, flow: str
-) -> None:
+def test_the_log_prob_written_is_that_of_the_action(state: TensorDictBase, flow: str) -> None:
     # In float64, where the inverse of the distribution's log_prob is good enough to tell.
     actor = make_actor(flow=flow, return_log_prob=True).double()
     out = actor(doubled(state))
@@ -292,9 +264,7 @@ def test_the_log_prob_written_is_that_of_the_action(
     torch.testing.assert_close(actor.log_prob(out), out["action_log_prob"], rtol=1e-7, atol=1e-7)
 
 
-def test_saturated_samples_have_finite_log_probs(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_saturated_samples_have_finite_log_probs(state: TensorDictBase) -> None:
     # Which the inverse could not give: it sees 1.0, where tanh of 12 and of 1000 are the same.
     actor = make_actor(Latent(12.0, 1.0), return_log_prob=True)
     assert actor(state)["action_log_prob"].isfinite().all()
@@ -313,13 +283,13 @@ def test_a_log_prob_key_of_ones_own(env: TransformedEnv, state: TensorDictBase) 
     assert out["score"].shape == (8,)
 
 
-def test_a_tensordict_for_the_output(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_a_tensordict_for_the_output(state: TensorDictBase) -> None:
     out = make_actor()(state, tensordict_out=TensorDict(batch_size=[8]))
     assert set(out.keys()) == {"loc", "scale", "action"}
     assert "action" not in state.keys()  # noqa: SIM118 - a tensordict iterates over its batch
 
 
-def test_the_projection_has_no_log_prob(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_the_projection_has_no_log_prob(state: TensorDictBase) -> None:
     with pytest.raises(ValueError, match="return_log_prob: expected False for ProjectionFlow"):
         make_actor(flow="projection", return_log_prob=True)
     actor = make_actor(flow="projection")
@@ -327,9 +297,7 @@ def test_the_projection_has_no_log_prob(make_actor: MakeActor, state: TensorDict
         actor.get_dist(actor(state)).log_prob(state["action"])
 
 
-def test_the_projection_agrees_with_tanh_where_nothing_binds(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_the_projection_agrees_with_tanh_where_nothing_binds(state: TensorDictBase) -> None:
     torch.manual_seed(1)
     projected = make_actor(flow="projection")(state.clone())["action"]
     torch.manual_seed(1)
@@ -354,7 +322,7 @@ def test_the_projection_agrees_with_tanh_where_nothing_binds(
     ids=["deep", "pickle"],
 )
 def test_copies_act_alike_and_share_nothing(
-    make_actor: MakeActor, state: TensorDictBase, flow: str, copied: Callable[..., nn.Module]
+    state: TensorDictBase, flow: str, copied: Callable[..., nn.Module]
 ) -> None:
     actor = make_actor(flow=flow)
     other = copied(actor)
@@ -368,7 +336,7 @@ def test_copies_act_alike_and_share_nothing(
 
 
 def test_state_dict_round_trip_holds_the_network_and_nothing_else(
-    env: TransformedEnv, make_actor: MakeActor, state: TensorDictBase
+    env: TransformedEnv, state: TensorDictBase
 ) -> None:
     actor = make_actor()
     network = nn.Sequential(nn.Linear(5, 4), nn.ReLU())  # of another size
@@ -387,7 +355,7 @@ def test_state_dict_round_trip_holds_the_network_and_nothing_else(
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_float64_all_the_way(make_actor: MakeActor, state: TensorDictBase, flow: str) -> None:
+def test_float64_all_the_way(state: TensorDictBase, flow: str) -> None:
     actor = make_actor(flow=flow, return_log_prob=True)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         single = actor(state.clone())["action"]
@@ -399,7 +367,7 @@ def test_float64_all_the_way(make_actor: MakeActor, state: TensorDictBase, flow:
 
 @pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_float64_actions_on_float32_geometry_survive_the_cast(
-    make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str
+    state: TensorDictBase, flow: str
 ) -> None:
     actor = make_actor(LATENTS["saturated"], flow=flow).to(torch.float64)
     many = state.expand(500, *state.shape).clone()
@@ -412,7 +380,7 @@ def test_float64_actions_on_float32_geometry_survive_the_cast(
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("flow", SAFE_FLOWS)
 def test_actions_on_float64_geometry_are_allowed(
-    make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str, dtype: torch.dtype
+    state: TensorDictBase, flow: str, dtype: torch.dtype
 ) -> None:
     """Observations of float64, as Gymnasium's MuJoCo environments give, under a float32 spec."""
     actor = make_actor(LATENTS["saturated"], flow=flow)
@@ -427,7 +395,7 @@ def test_actions_on_float64_geometry_are_allowed(
     assert all(held.all() for held in inside(many).values())
 
 
-def test_moving_to_a_device_takes_the_bounds_along(make_actor: MakeActor) -> None:
+def test_moving_to_a_device_takes_the_bounds_along() -> None:
     head = flow_head(make_actor())
     where = TensorDict(device="meta").set("loc", torch.zeros(2))
     assert (
@@ -458,7 +426,7 @@ def test_nothing_else_changes_the_bounds(change: Callable[..., nn.Module]) -> No
 
 
 def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(
-    make_actor: MakeActor, env: TransformedEnv, state: TensorDictBase
+    env: TransformedEnv, state: TensorDictBase
 ) -> None:
     def loss_of(spec: TensorSpec) -> SACLoss:
         network = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
@@ -474,9 +442,7 @@ def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(
     assert not any("bound" in key for key in narrow.state_dict())
 
 
-def test_the_compiled_actor_is_one_graph_and_acts_alike(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_the_compiled_actor_is_one_graph_and_acts_alike(state: TensorDictBase) -> None:
     torch._dynamo.reset()
     actor = make_actor()
     compiled = torch.compile(actor, backend="aot_eager", fullgraph=True)
@@ -534,7 +500,7 @@ def test_specs_without_such_a_box_are_refused(spec: TensorSpec, message: str) ->
         make_constrained_actor(nn.Identity(), spec=spec, bijectors=[])
 
 
-def test_views_and_composition_keep_options(make_actor: MakeActor) -> None:
+def test_views_and_composition_keep_options() -> None:
     actor = make_actor(flow="radial", order=["obstacle", "battery"], return_log_prob=True)
     view, again = with_reference_entropy(actor), constrain(actor, flow="radial")
     for other in (flow_head(view), flow_head(again)):

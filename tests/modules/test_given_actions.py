@@ -2,7 +2,6 @@
 
 import copy
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -16,9 +15,8 @@ from torchrl.objectives import ClipPPOLoss
 from cnfp_torchrl.bijectors import well_inside
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.modules import LostDensityWarning, flow_head, split_at_latent
-from tests.modules.conftest import STATES
+from tests.modules.point_nav import STATES, make_actor
 
-MakeActor = Callable[..., Any]
 FLOWS = ["exact", "gauge", "radial", "unconstrained"]
 DEPTH = 1e-3
 
@@ -46,9 +44,7 @@ def distribution(actor: Any, state: TensorDictBase) -> ConstrainedFlow:
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_inside_it_is_the_density_itself(
-    make_actor: MakeActor, state: TensorDictBase, flow: str
-) -> None:
+def test_inside_it_is_the_density_itself(state: TensorDictBase, flow: str) -> None:
     dist = distribution(make_actor(flow=flow), state)
     action = well_inside(dist.bijector, dist.sample((50,)), 0.1)
     scored = dist.nearest_log_prob(action, DEPTH)
@@ -60,7 +56,7 @@ def test_inside_it_is_the_density_itself(
 @pytest.mark.parametrize("flow", FLOWS)
 @pytest.mark.parametrize("beyond", [1.0, 1.0 + 1e-6, 1.5, 1e6])
 def test_on_and_beyond_the_boundary_it_is_finite(
-    make_actor: MakeActor, state: TensorDictBase, flow: str, beyond: float
+    state: TensorDictBase, flow: str, beyond: float
 ) -> None:
     actor = make_actor(flow=flow)
     dist = distribution(actor, state)
@@ -82,18 +78,14 @@ def test_on_and_beyond_the_boundary_it_is_finite(
     assert any(gradient.abs().max() > 0 for gradient in gradients)
 
 
-def test_a_chain_is_pulled_in_without_an_anchor(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_a_chain_is_pulled_in_without_an_anchor(state: TensorDictBase) -> None:
     dist = distribution(make_actor(flow="squash"), state)
     scored = dist.nearest_log_prob(torch.full((len(STATES), 2), 0.9))
     assert scored.log_prob.isfinite().all()
     assert (scored.moved > 0).any()
 
 
-def test_cloning_of_demonstrations_on_the_boundary_learns(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_cloning_of_demonstrations_on_the_boundary_learns(state: TensorDictBase) -> None:
     actor = make_actor(flow="exact")
     with torch.no_grad():
         expert = distribution(make_actor(Saturated()), state).deterministic_sample
@@ -110,7 +102,7 @@ def test_cloning_of_demonstrations_on_the_boundary_learns(
 
 
 @pytest.mark.parametrize("depth", [0.0, 1.0, -0.1])
-def test_a_bad_depth_is_refused(make_actor: MakeActor, state: TensorDictBase, depth: float) -> None:
+def test_a_bad_depth_is_refused(state: TensorDictBase, depth: float) -> None:
     with pytest.raises(ValueError, match="depth: expected a share between 0 and 1, given"):
         distribution(make_actor(), state).nearest_log_prob(torch.zeros(8, 2), depth)
 
@@ -119,13 +111,13 @@ def test_a_bad_depth_is_refused(make_actor: MakeActor, state: TensorDictBase, de
     "given", [torch.zeros(8, 3), torch.zeros(7, 2), torch.zeros(8, 2).long()], ids=["d", "n", "int"]
 )
 def test_actions_of_another_shape_or_dtype_are_refused(
-    make_actor: MakeActor, state: TensorDictBase, given: torch.Tensor
+    state: TensorDictBase, given: torch.Tensor
 ) -> None:
     with pytest.raises(ValueError, match="value: expected floating actions"):
         distribution(make_actor(), state).nearest_log_prob(given)
 
 
-def test_what_is_not_finite_is_refused(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_what_is_not_finite_is_refused(state: TensorDictBase) -> None:
     given = torch.zeros(8, 2)
     given[3, 1] = torch.nan
     with pytest.raises(ValueError, match=r"value at index \[3, 1\]: .*given nan"):
@@ -148,9 +140,7 @@ def ppo(actor: Any) -> ClipPPOLoss:
     return ClipPPOLoss(actor, value, entropy_bonus=False)
 
 
-def test_ppo_on_a_plain_actor_warns_once_and_names_the_remedy(
-    make_actor: MakeActor, env: TransformedEnv
-) -> None:
+def test_ppo_on_a_plain_actor_warns_once_and_names_the_remedy(env: TransformedEnv) -> None:
     actor = make_actor(Saturated(), return_log_prob=True)
     batch = collected(env, actor)
     loss = ppo(actor)
@@ -159,7 +149,7 @@ def test_ppo_on_a_plain_actor_warns_once_and_names_the_remedy(
     loss(batch.clone())  # any warning is an error here
 
 
-def test_ppo_on_the_latents_does_not_warn(make_actor: MakeActor, env: TransformedEnv) -> None:
+def test_ppo_on_the_latents_does_not_warn(env: TransformedEnv) -> None:
     policy, base = split_at_latent(make_actor(Saturated()))
     batch = collected(env, policy)
     with warnings.catch_warnings():
@@ -167,12 +157,10 @@ def test_ppo_on_the_latents_does_not_warn(make_actor: MakeActor, env: Transforme
         assert ppo(base)(batch)["loss_objective"].isfinite()
 
 
-def test_actions_of_others_far_outside_are_no_reason_to_warn(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_actions_of_others_far_outside_are_no_reason_to_warn(state: TensorDictBase) -> None:
     dist = distribution(make_actor(), state)
     assert dist.log_prob(torch.full((8, 2), 5.0)).isneginf().all()
 
 
-def test_an_actor_that_has_warned_can_be_copied(make_actor: MakeActor) -> None:
+def test_an_actor_that_has_warned_can_be_copied() -> None:
     copy.deepcopy(make_actor())

@@ -1,8 +1,6 @@
 """The last check of executed actions: it raises, it names, and it never repairs."""
 
 import re
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -18,14 +16,13 @@ from cnfp_torchrl.modules import (
     flow_head,
     guarded,
 )
-
-MakeActor = Callable[..., Any]
+from tests.modules.point_nav import make_actor, make_tanh_actor
 
 AGENT = 2
 
 
 @pytest.fixture
-def guard(make_actor: MakeActor) -> ExecutedActionGuard:
+def guard() -> ExecutedActionGuard:
     return ExecutedActionGuard(make_actor())
 
 
@@ -156,15 +153,13 @@ def test_the_index_has_the_batch_dimensions(
 
 
 @pytest.mark.parametrize("flow", ["exact", "radial"])
-def test_guarded_exact_flows_run_through(
-    env: TransformedEnv, make_actor: MakeActor, flow: str
-) -> None:
+def test_guarded_exact_flows_run_through(env: TransformedEnv, flow: str) -> None:
     policy = guarded(make_actor(flow=flow))
     rollout = env.rollout(50, policy, break_when_any_done=False)
     assert rollout["next", "cost"].sum() == 0
 
 
-def test_guarded_actors_are_really_guarded(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_guarded_actors_are_really_guarded(state: TensorDictBase) -> None:
     # A fault behind the flow.
     actor = make_actor()
     policy = guarded(actor)
@@ -177,12 +172,12 @@ def test_guarded_actors_are_really_guarded(make_actor: MakeActor, state: TensorD
 
 
 @pytest.mark.parametrize("flow", ["squash", "unconstrained"])
-def test_flows_without_a_guarantee_are_not_guarded(make_actor: MakeActor, flow: str) -> None:
+def test_flows_without_a_guarantee_are_not_guarded(flow: str) -> None:
     actor = make_actor(flow=flow)
     assert guarded(actor) is actor
 
 
-def test_declared_keys_are_enough(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_declared_keys_are_enough(state: TensorDictBase) -> None:
     actor = make_actor()
     guard = ExecutedActionGuard(actor)
     SafeRandomPolicy(actor)(state)
@@ -190,7 +185,7 @@ def test_declared_keys_are_enough(make_actor: MakeActor, state: TensorDictBase) 
     assert guard.out_keys == ["action"]
 
 
-def test_a_guard_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: MakeActor) -> None:
+def test_a_guard_is_made_from_the_actor() -> None:
     for wrong in (flow_head(make_actor()), make_tanh_actor()):
         with pytest.raises(TypeError, match=r"actor: expected.*given"):
             ExecutedActionGuard(wrong)
@@ -201,9 +196,7 @@ def test_a_guard_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: 
     [(0.25, "relaxed by 0.25"), (torch.inf, "dropped")],
     ids=["relaxed", "dropped"],
 )
-def test_relaxation_can_be_refused(
-    make_actor: MakeActor, acted: TensorDictBase, amount: float, how: str
-) -> None:
+def test_relaxation_can_be_refused(acted: TensorDictBase, amount: float, how: str) -> None:
     strict = ExecutedActionGuard(make_actor(), refuse_relaxation=True)
     assert strict(acted) is acted
     # The action keeps even the set as stated.
@@ -218,9 +211,7 @@ def test_relaxation_can_be_refused(
     assert not isinstance(caught.value, RelaxedConstraintError)
 
 
-def test_refused_relaxation_reaches_the_guard_of_an_actor(
-    make_actor: MakeActor, state: TensorDictBase
-) -> None:
+def test_refused_relaxation_reaches_the_guard_of_an_actor(state: TensorDictBase) -> None:
     policy = guarded(make_actor(), refuse_relaxation=True)
     policy(state.clone())
     with pytest.raises(RelaxedConstraintError, match="'obstacle'"):

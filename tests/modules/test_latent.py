@@ -15,7 +15,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
-from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, SoftUpdate, TD3Loss
+from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss
 
 from cnfp_torchrl.modules import (
     FlowMap,
@@ -26,8 +26,7 @@ from cnfp_torchrl.modules import (
     split_at_latent,
     with_reference_entropy,
 )
-
-Inside = Callable[[TensorDictBase], dict[str, Tensor]]
+from tests.modules.point_nav import inside, make_actor, make_tanh_actor
 
 
 class Gaussian(nn.Module):
@@ -62,9 +61,7 @@ def critic() -> ValueOperator:
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_policy_stores_latents_and_acts_on_them(
-    scale: float, state: TensorDictBase, make_actor: Callable[..., Any], inside: Inside
-) -> None:
+def test_policy_stores_latents_and_acts_on_them(scale: float, state: TensorDictBase) -> None:
     actor = make_actor(Gaussian(0.3, scale))
     policy = split_at_latent(actor).policy
     with torch.no_grad():
@@ -78,9 +75,7 @@ def test_policy_stores_latents_and_acts_on_them(
     torch.testing.assert_close(steps["latent_log_prob"], expected)
 
 
-def test_policy_has_the_distribution_of_the_actor(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_policy_has_the_distribution_of_the_actor(state: TensorDictBase) -> None:
     """Base density less log-determinant is the actor's own density, by inversion, of the action."""
     actor = make_actor(Gaussian(0.2, 0.5).double())
     state = many(state.apply(lambda t: t.double() if t.is_floating_point() else t), 16)
@@ -92,9 +87,7 @@ def test_policy_has_the_distribution_of_the_actor(
     torch.testing.assert_close(steps["latent_log_prob"] - log_det, expected, rtol=0, atol=1e-7)
 
 
-def test_deterministic_actions_are_those_of_the_actor(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_deterministic_actions_are_those_of_the_actor(state: TensorDictBase) -> None:
     actor = make_actor()
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         expected = actor(state.copy())["action"]
@@ -103,9 +96,7 @@ def test_deterministic_actions_are_those_of_the_actor(
     torch.testing.assert_close(steps["latent"], steps["loc"], rtol=0, atol=0)
 
 
-def test_keys_and_options_of_the_actor_are_kept(
-    env: TransformedEnv, state: TensorDictBase, make_tanh_actor: Callable[..., Any]
-) -> None:
+def test_keys_and_options_of_the_actor_are_kept(env: TransformedEnv, state: TensorDictBase) -> None:
     drawn = make_tanh_actor(num_samples=3, default_interaction_type=InteractionType.RANDOM)
     actor = constrain(drawn, env)
     policy, base = split_at_latent(actor, latent_key=("inner", "z"), log_prob_key="score")
@@ -122,7 +113,7 @@ def test_keys_and_options_of_the_actor_are_kept(
     torch.testing.assert_close(steps["latent"], steps["loc"])
 
 
-def test_networks_are_shared_and_nothing_is_added(make_actor: Callable[..., Any]) -> None:
+def test_networks_are_shared_and_nothing_is_added() -> None:
     actor = make_actor()
     policy, base = split_at_latent(actor)
     own = {id(parameter) for parameter in actor.parameters()}
@@ -136,7 +127,7 @@ def test_networks_are_shared_and_nothing_is_added(make_actor: Callable[..., Any]
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
 def test_both_parts_can_be_copied_and_sent(
-    copied: Callable[[Any], Any], state: TensorDictBase, make_actor: Callable[..., Any]
+    copied: Callable[[Any], Any], state: TensorDictBase
 ) -> None:
     policy, base = split_at_latent(make_actor())
     with torch.no_grad():
@@ -150,7 +141,7 @@ def test_both_parts_can_be_copied_and_sent(
 
 @pytest.mark.parametrize("loc", [0.0, 3.0, 12.0, 40.0])
 def test_ppo_ratios_are_one_before_an_update(
-    loc: float, state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
+    loc: float, state: TensorDictBase, critic: ValueOperator
 ) -> None:
     policy, base = split_at_latent(make_actor(Gaussian(loc, 0.7)))
     with torch.no_grad():
@@ -162,7 +153,7 @@ def test_ppo_ratios_are_one_before_an_update(
 
 
 def test_the_action_itself_could_not_be_scored(
-    state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
+    state: TensorDictBase, critic: ValueOperator
 ) -> None:
     """Why latents are stored: the same loss on stored actions, which it inverts."""
     actor = make_actor(Gaussian(12.0, 0.7), return_log_prob=True)
@@ -174,9 +165,7 @@ def test_the_action_itself_could_not_be_scored(
     assert not losses["ESS"].item() > 0.1
 
 
-def test_ratios_of_latents_are_those_of_actions(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_ratios_of_latents_are_those_of_actions(state: TensorDictBase) -> None:
     """In float64 and far from saturation, where actions can be scored by inversion."""
     network = Gaussian(0.2, 0.5).double()
     actor = make_actor(network)
@@ -194,7 +183,7 @@ def test_ratios_of_latents_are_those_of_actions(
 
 
 def test_ppo_update_reaches_the_network_and_moves_the_ratio(
-    state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
+    state: TensorDictBase, critic: ValueOperator
 ) -> None:
     network = Gaussian(12.0, 0.7)
     policy, base = split_at_latent(make_actor(network))
@@ -214,9 +203,7 @@ def test_ppo_update_reaches_the_network_and_moves_the_ratio(
     assert loss(steps)["ESS"] < 1
 
 
-def test_divergence_is_that_of_the_gaussians(
-    state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
-) -> None:
+def test_divergence_is_that_of_the_gaussians(state: TensorDictBase, critic: ValueOperator) -> None:
     network = Gaussian(1.0, 0.7)
     policy, base = split_at_latent(make_actor(network))
     with torch.no_grad():
@@ -227,9 +214,7 @@ def test_divergence_is_that_of_the_gaussians(
     assert losses["kl"].mean().item() == pytest.approx(1, abs=1e-4)
 
 
-def test_the_flow_moves_with_the_loss(
-    state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
-) -> None:
+def test_the_flow_moves_with_the_loss(state: TensorDictBase, critic: ValueOperator) -> None:
     policy, base = split_at_latent(make_actor())
     with torch.no_grad():
         steps = with_advantages(policy(state))
@@ -242,9 +227,7 @@ def test_the_flow_moves_with_the_loss(
 # The entropy bonus
 
 
-def test_entropy_is_that_of_the_action(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_entropy_is_that_of_the_action(state: TensorDictBase) -> None:
     actor = make_actor(Gaussian(0.3, 0.8))
     base = split_at_latent(actor).base
     with torch.no_grad():
@@ -254,9 +237,7 @@ def test_entropy_is_that_of_the_action(
     assert bool(((estimate.mean(0) - expected.mean(0)).abs() < 5 * error).all())
 
 
-def test_entropy_does_not_reward_a_scale_without_end(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_entropy_does_not_reward_a_scale_without_end(state: TensorDictBase) -> None:
     """The latent's own entropy grows with the scale for ever, the action's falls in the end."""
     entropies, gradients = [], []
     for scale in (0.5, 10.0):
@@ -270,9 +251,7 @@ def test_entropy_does_not_reward_a_scale_without_end(
     assert bool((gradients[1] < 0).all())
 
 
-def test_ppo_takes_this_entropy(
-    state: TensorDictBase, make_actor: Callable[..., Any], critic: ValueOperator
-) -> None:
+def test_ppo_takes_this_entropy(state: TensorDictBase, critic: ValueOperator) -> None:
     policy, base = split_at_latent(make_actor(Gaussian(0.0, 10.0)))
     with torch.no_grad():
         steps = with_advantages(policy(many(state, 200)))
@@ -282,9 +261,7 @@ def test_ppo_takes_this_entropy(
     assert losses["loss_entropy"].item() == pytest.approx(-losses["entropy"].item(), rel=1e-5)
 
 
-def test_reference_entropy_can_be_asked_for(
-    state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_reference_entropy_can_be_asked_for(state: TensorDictBase) -> None:
     actor = make_actor(Gaussian(0.3, 0.8))
     steps = many(state, 2000)
     with torch.no_grad():
@@ -300,7 +277,7 @@ def test_reference_entropy_can_be_asked_for(
 
 
 def test_noise_on_the_latent_stays_allowed_and_on_the_action_does_not(
-    state: TensorDictBase, make_actor: Callable[..., Any], inside: Inside
+    state: TensorDictBase,
 ) -> None:
     flow = FlowMap(flow_head(make_actor()))
     network = TensorDictModule(nn.Linear(5, 2), ["observation"], ["latent"])
@@ -316,90 +293,27 @@ def test_noise_on_the_latent_stays_allowed_and_on_the_action_does_not(
     assert not bool(inside(broken)["obstacle"].all())
 
 
-class Recorder(nn.Module):
-    """A critic of actions that remembers what it was asked."""
-
-    def __init__(self, asked: list[Tensor]) -> None:
-        super().__init__()
-        self.asked = asked
-        self.network = MLP(7, 1, num_cells=[8])
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Recorder":
-        fresh = Recorder(self.asked)
-        fresh.network = copy.deepcopy(self.network, memo)
-        return fresh
-
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        self.asked.append(action.detach().clone())
-        return self.network(observation, action)
-
-
-@pytest.mark.parametrize("vectorised", [True, False])
-def test_td3_asks_its_critic_about_allowed_actions_only(
-    vectorised: bool, state: TensorDictBase, make_actor: Callable[..., Any], inside: Inside
-) -> None:
-    """With the latent for its action, TD3's target noise is added before the flow."""
-    flow = FlowMap(flow_head(make_actor()))
-    network = TensorDictModule(MLP(5, 2, num_cells=[8]), ["observation"], ["latent"])
-    actor = TensorDictSequential(network, flow)
-    asked: list[Tensor] = []
-    value: nn.Module = MLP(7, 1, num_cells=[8]) if vectorised else Recorder(asked)
-    critic = TensorDictSequential(flow, ValueOperator(value, in_keys=["observation", "action"]))
-    loss = TD3Loss(
-        actor,
-        critic,
-        bounds=(-torch.inf, torch.inf),
-        policy_noise=3.0,
-        noise_clip=10.0,
-        deactivate_vmap=not vectorised,
-    )
-    loss.set_keys(action="latent")
-    loss.make_value_estimator(gamma=0.9)
-    SoftUpdate(loss, tau=0.1)  # TorchRL warns without one
-    with torch.no_grad():
-        steps = actor(state.copy())
-    after = state.copy()
-    flags = torch.zeros(*state.shape, 1, dtype=torch.bool)
-    after.update({"reward": flags.float(), "done": flags, "terminated": flags})
-    steps["next"] = after
-    losses = loss(steps)
-    (losses["loss_actor"] + losses["loss_qvalue"]).backward()
-    for name, parameter in network.named_parameters():
-        assert parameter.grad is not None, name
-        assert bool(parameter.grad.isfinite().all()), name
-        assert bool((parameter.grad != 0).any()), name
-    if not vectorised:
-        assert len(asked) == 6  # two critics: the actor's loss, the target, the stored latent
-        for action in asked:
-            for name, good in inside(state.copy().set("action", action)).items():
-                assert bool(good.all()), name
-        # The noise has an effect.
-        assert bool((asked[2] - steps["action"]).abs().max() > 0.1)
-
-
 # Refusals
 
 
-def test_an_actor_without_constraints_is_refused(make_tanh_actor: Callable[..., Any]) -> None:
+def test_an_actor_without_constraints_is_refused() -> None:
     with pytest.raises(TypeError, match="ConstrainedFlowModule"):
         split_at_latent(make_tanh_actor())
 
 
-def test_a_missing_latent_is_named(state: TensorDictBase, make_actor: Callable[..., Any]) -> None:
+def test_a_missing_latent_is_named(state: TensorDictBase) -> None:
     with pytest.raises(MissingGeometryError, match=r"expected latent, .* before the map"):
         FlowMap(flow_head(make_actor()))(state.copy())
 
 
-def test_missing_geometry_is_named(state: TensorDictBase, make_actor: Callable[..., Any]) -> None:
+def test_missing_geometry_is_named(state: TensorDictBase) -> None:
     bare = state.select("observation").set("latent", torch.zeros(*state.shape, 2))
     with pytest.raises(MissingGeometryError, match="battery"):
         FlowMap(flow_head(make_actor()))(bare)
 
 
 @pytest.mark.parametrize("size", [1, 3])
-def test_a_latent_of_another_size_is_refused(
-    size: int, state: TensorDictBase, make_actor: Callable[..., Any]
-) -> None:
+def test_a_latent_of_another_size_is_refused(size: int, state: TensorDictBase) -> None:
     message = re.escape(
         f"expected latents of 2 components, as the action has, given shape (8, {size})"
     )

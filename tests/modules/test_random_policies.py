@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -15,9 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.modules import SafeRandomPolicy, WarmUpPolicy, flow_head
-
-MakeActor = Callable[..., Any]
-Inside = Callable[[TensorDictBase], dict[str, Tensor]]
+from tests.modules.point_nav import inside, make_actor, make_tanh_actor
 
 AGENTS = 8
 
@@ -41,7 +37,7 @@ def random_steps(rollout: TensorDictBase) -> list[bool]:
 
 @pytest.mark.parametrize("flow", ["exact", "radial"])
 def test_random_actions_are_inside_where_uniform_ones_are_not(
-    env: TransformedEnv, make_actor: MakeActor, state: TensorDictBase, inside: Inside, flow: str
+    env: TransformedEnv, state: TensorDictBase, flow: str
 ) -> None:
     many = state.expand(500, AGENTS).clone()
     for name, held in inside(SafeRandomPolicy(make_actor(flow=flow))(many)).items():
@@ -54,7 +50,7 @@ def test_random_actions_are_inside_where_uniform_ones_are_not(
 
 @pytest.mark.parametrize("exploration", [None, *ExplorationType], ids=str)
 def test_it_is_random_under_every_exploration_type(
-    make_actor: MakeActor, state: TensorDictBase, exploration: ExplorationType | None
+    state: TensorDictBase, exploration: ExplorationType | None
 ) -> None:
     policy = SafeRandomPolicy(make_actor())
     with set_exploration_type(exploration):
@@ -63,7 +59,7 @@ def test_it_is_random_under_every_exploration_type(
 
 
 @pytest.mark.parametrize("return_log_prob", [False, True])
-def test_declared_keys(make_actor: MakeActor, state: TensorDictBase, return_log_prob: bool) -> None:
+def test_declared_keys(state: TensorDictBase, return_log_prob: bool) -> None:
     policy = SafeRandomPolicy(make_actor(return_log_prob=return_log_prob))
     given = state.select(*policy.in_keys)
     out = policy(given)
@@ -71,7 +67,7 @@ def test_declared_keys(make_actor: MakeActor, state: TensorDictBase, return_log_
     assert ("action_log_prob" in policy.out_keys) == return_log_prob
 
 
-def test_it_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: MakeActor) -> None:
+def test_it_is_made_from_the_actor() -> None:
     for wrong in (flow_head(make_actor()), make_tanh_actor()):
         with pytest.raises(TypeError, match=r"actor: expected.*given"):
             SafeRandomPolicy(wrong)
@@ -83,16 +79,14 @@ def test_it_is_made_from_the_actor(make_actor: MakeActor, make_tanh_actor: MakeA
 @pytest.mark.parametrize(
     ("frames", "steps"), [(0, 0), (1, 1), (8, 1), (9, 2), (24, 3), (10_000, 6)]
 )
-def test_it_switches_after_the_stated_frames(
-    env: TransformedEnv, make_actor: MakeActor, frames: int, steps: int
-) -> None:
+def test_it_switches_after_the_stated_frames(env: TransformedEnv, frames: int, steps: int) -> None:
     policy = WarmUpPolicy(make_actor(Marked()), frames)
     rollout = env.rollout(6, policy, break_when_any_done=False)
     assert random_steps(rollout) == [step < steps for step in range(6)]
 
 
 def test_unbatched_environments_count_single_frames(
-    env: TransformedEnv, make_actor: MakeActor, state: TensorDictBase
+    env: TransformedEnv, state: TensorDictBase
 ) -> None:
     policy = WarmUpPolicy(make_actor(Marked()), 2)
     assert [bool((policy(state[0].clone())["loc"] == 0).all()) for _ in range(4)] == [
@@ -105,7 +99,7 @@ def test_unbatched_environments_count_single_frames(
 
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 def test_every_step_is_alike_and_scored_by_what_drew_it(
-    env: TransformedEnv, make_actor: MakeActor, inside: Inside, exploration: ExplorationType
+    env: TransformedEnv, exploration: ExplorationType
 ) -> None:
     actor = make_actor(Marked(), return_log_prob=True)
     policy = WarmUpPolicy(actor, 3 * AGENTS)
@@ -123,7 +117,7 @@ def test_every_step_is_alike_and_scored_by_what_drew_it(
     assert rollout["next", "cost"].sum() == 0
 
 
-def test_in_a_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
+def test_in_a_collector(env: TransformedEnv) -> None:
     # The collector tries its policy once, to learn its keys; that call counts too.
     policy = WarmUpPolicy(make_actor(Marked()), 4 * AGENTS)
     collector = Collector(
@@ -138,7 +132,7 @@ def test_in_a_collector(env: TransformedEnv, make_actor: MakeActor) -> None:
     assert policy.frames_left <= 0
 
 
-def test_counting_down_compiles_nothing_anew(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_counting_down_compiles_nothing_anew(state: TensorDictBase) -> None:
     torch._dynamo.reset()
     counter = CompileCounter()
     warm_up = WarmUpPolicy(make_actor(), 5 * state.numel())
@@ -154,7 +148,7 @@ def test_counting_down_compiles_nothing_anew(make_actor: MakeActor, state: Tenso
     assert counts[5] == counts[-1]
 
 
-def test_copies_count_alone(make_actor: MakeActor, state: TensorDictBase) -> None:
+def test_copies_count_alone(state: TensorDictBase) -> None:
     policy = WarmUpPolicy(make_actor(), 20)
     copies = copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))
     policy(state.clone())
@@ -164,6 +158,6 @@ def test_copies_count_alone(make_actor: MakeActor, state: TensorDictBase) -> Non
     assert policy.frames_left == 20
 
 
-def test_a_negative_number_of_frames_is_refused(make_actor: MakeActor) -> None:
+def test_a_negative_number_of_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="frames: expected a number >= 0, given -1"):
         WarmUpPolicy(make_actor(), -1)

@@ -12,6 +12,9 @@ from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.networks import action_value_network, gaussian_network
+from tests.training.conftest import tiny_run
+
+__all__ = ["tiny_run"]
 
 MakeActor = Callable[..., Any]
 

@@ -1,12 +1,10 @@
 """SAC-Lagrangian against a re-implementation in plain PyTorch, its multipliers, its training."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -15,12 +13,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
-from cnfp_torchrl.configuration import config_directory
 from cnfp_torchrl.modules import with_reference_entropy
 from cnfp_torchrl.objectives import SACLagrangianLoss
 from cnfp_torchrl.training.networks import action_cost_network
-from cnfp_torchrl.training.run_folder import RunFolder
-from cnfp_torchrl.training.train import train
+from tests.training.conftest import TinyRun
 
 MakeActor = Callable[..., Any]
 MakeLoss = Callable[..., SACLagrangianLoss]
@@ -392,48 +388,10 @@ def test_costs_of_another_shape_are_refused(make_loss: MakeLoss, batch: TensorDi
 
 # As methods of the trainer ------------------------------------------------------------------------
 
-TINY = [
-    "collector.total_frames=192",
-    "training.warmup_frames=96",
-    "training.update_ratio=0.05",
-    "training.log_interval=64",
-    "evaluation.episodes=4",
-    "+env.base.max_steps=12",
-    "figures=none",
-]
-EXPERIMENTS = sorted(path.stem for path in config_directory().glob("experiment/*.yaml"))
 
-
-def tiny_run(folder: Path, *overrides: str) -> dict[str, Any]:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=[*TINY, *overrides])
-    return train(config, RunFolder.create(folder))
-
-
-def form(value: Any) -> Any:
-    """Return the keys and types of a summary, but for how constraints gave way.
-
-    Without an anchor nobody finds out whether a constraint can hold, and there is nothing to tell.
-    """
-    if isinstance(value, dict):
-        return {key: form(entry) for key, entry in value.items() if key != "constraints"}
-    return type(value).__name__
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_reports_in_one_form(experiment: str, tmp_path: Path) -> None:
-    summary = tiny_run(tmp_path / "run", f"experiment={experiment}")
-    assert form(summary) == form(tiny_run(tmp_path / "reference"))
-    violations = sum(summary["violations"].values())
-    if experiment.startswith(("exact", "projection")):
-        assert violations == 0
-    elif not experiment.startswith("squash"):
-        assert violations > 0
-
-
-def test_the_lagrangian_is_logged_by_name_and_trained(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "run", "experiment=lagrangian", "logger=csv")
-    scalars = tmp_path / "run" / "metrics" / "scalars"
+def test_the_lagrangian_is_logged_by_name_and_trained(tiny_run: TinyRun) -> None:
+    folder, _ = tiny_run("experiment=lagrangian", "logger=csv")
+    scalars = folder.path / "metrics" / "scalars"
     for name in (
         "loss/cost",
         "loss/lagrange",
@@ -442,10 +400,10 @@ def test_the_lagrangian_is_logged_by_name_and_trained(tmp_path: Path) -> None:
     ):
         _, value = (scalars / f"{name}.csv").read_text().splitlines()[-1].split(",")
         assert torch.isfinite(torch.tensor(float(value)))
-    state = RunFolder.open(tmp_path / "run").load_checkpoint()["loss"]
+    state = folder.load_checkpoint()["loss"]
     assert (state["log_lagrange"] != 0).all()
 
 
-def test_thresholds_of_another_number_are_refused_by_name(tmp_path: Path) -> None:
+def test_thresholds_of_another_number_are_refused_by_name(tiny_run: TinyRun) -> None:
     with pytest.raises(Exception, match=r"\['obstacle', 'battery'\], given \[0.0\]"):
-        tiny_run(tmp_path / "run", "experiment=lagrangian", "loss.thresholds=[0.0]")
+        tiny_run("experiment=lagrangian", "loss.thresholds=[0.0]")

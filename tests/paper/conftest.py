@@ -3,10 +3,10 @@
 import pytest
 
 from experiments.paper import statistics
-from tests.training.conftest import make_config, tiny_run
+from tests.training.conftest import tiny_run
 from tests.visual.conftest import draws
 
-__all__ = ["draws", "make_config", "tiny_run"]
+__all__ = ["draws", "tiny_run"]
 
 
 @pytest.fixture

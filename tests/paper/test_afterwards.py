@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +6,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.tasks.point_nav import Layout, ShortestPath
 from cnfp_torchrl.tasks.point_nav.shortest_path import CAUTIOUS
 from cnfp_torchrl.training.agent import build_environment
@@ -22,15 +22,13 @@ from experiments.paper.afterwards import (
 )
 from tests.training.conftest import TINY
 
-MakeConfig = Callable[..., DictConfig]
-
 
 @pytest.fixture(params=["exact", "unconstrained"])
-def run(request: pytest.FixtureRequest, make_config: MakeConfig, tmp_path: Path) -> RunFolder:
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> RunFolder:
     """A run of hardly any training: its policy knows nothing of any constraint."""
     folder = RunFolder.create(tmp_path / "run")
     episodes = [key for key in TINY if "max_steps" not in key and "episodes" not in key]
-    train(make_config(*episodes, "evaluation.episodes=40", f"flow={request.param}"), folder)
+    train(compose_config(*episodes, "evaluation.episodes=40", f"flow={request.param}"), folder)
     return folder
 
 
@@ -52,18 +50,16 @@ def test_an_untrained_flow_keeps_constraints_that_appear_later(run: RunFolder) -
         assert reserve["obstacle"] == before["obstacle"]
 
 
-def test_unchanged_it_is_the_evaluation_of_training(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_unchanged_it_is_the_evaluation_of_training(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
-    summary = train(make_config(*TINY), folder)
+    summary = train(compose_config(*TINY), folder)
     deterministic = evaluation(folder, folder.load_config()).deterministic
     assert deterministic.return_mean == summary["evaluation"]["deterministic"]["return_mean"]
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_every_part_of_the_task_has_the_changed_map(name: str, make_config: MakeConfig) -> None:
-    config = make_config()
+def test_every_part_of_the_task_has_the_changed_map(name: str) -> None:
+    config = compose_config()
     before = OmegaConf.to_container(config, resolve=True)
     new = changed(config, CHANGES[name])
     assert OmegaConf.to_container(config, resolve=True) == before
@@ -76,8 +72,8 @@ def test_every_part_of_the_task_has_the_changed_map(name: str, make_config: Make
     assert instantiate(new.env.baselines, _convert_="all")
 
 
-def test_a_map_of_the_run_is_kept(make_config: MakeConfig) -> None:
-    config = make_config("+env.layout.goal_radius=0.2", "+env.layout.rectangles=[[0,0,0.1,0.1]]")
+def test_a_map_of_the_run_is_kept() -> None:
+    config = compose_config("+env.layout.goal_radius=0.2", "+env.layout.rectangles=[[0,0,0.1,0.1]]")
     layout = instantiate(
         changed(config, CHANGES["second rectangle"]).env.base, _convert_="all"
     ).layout

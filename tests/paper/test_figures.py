@@ -1,12 +1,9 @@
 """The figures, from records made up for tests."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual import explain
 from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper.figures_flow import (
@@ -25,8 +22,8 @@ from experiments.paper.figures_methods import (
 )
 from experiments.paper.labels import LABELS, in_order, label
 from tests.paper.synthetic import changed, make_record, make_runs
+from tests.training.conftest import TinyRun
 
-TinyRun = Callable[..., tuple[RunFolder, dict[str, Any]]]
 ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.usefixtures("coarse")

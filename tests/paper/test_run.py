@@ -3,12 +3,12 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.figures import read_scalars
 from experiments import checkout
@@ -17,14 +17,13 @@ from experiments.paper.records import Record, RecordError, load_records
 from experiments.paper.run import do_run, settings
 from tests.training.conftest import TINY
 
-MakeConfig = Callable[..., DictConfig]
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "experiments" / "paper"
 
 
 @pytest.fixture
-def config(make_config: MakeConfig) -> DictConfig:
-    return make_config(*TINY, "experiment=unconstrained", "seed=3", "logger=csv")
+def config() -> DictConfig:
+    return compose_config(*TINY, "experiment=unconstrained", "seed=3", "logger=csv")
 
 
 def test_the_sweep_is_what_the_kept_records_show() -> None:

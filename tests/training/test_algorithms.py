@@ -1,22 +1,17 @@
 """SAC, TD3 and PPO by configuration: one folder, evaluation and resume for all."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 from experiments.resume import differences
 
-from .conftest import TINY
+from .conftest import TINY, TinyRun
 from .test_resume import go_on, run_until
-
-Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
-MakeConfig = Callable[..., DictConfig]
 
 ALGORITHMS = {
     "sac": ["algorithm=sac"],
@@ -33,7 +28,7 @@ LEARNED = {
 
 @pytest.mark.parametrize("flow", ["exact", "projection", "unconstrained"])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_algorithm_trains_all_that_it_has(name: str, flow: str, tiny_run: Run) -> None:
+def test_every_algorithm_trains_all_that_it_has(name: str, flow: str, tiny_run: TinyRun) -> None:
     folder, summary = tiny_run(*ALGORITHMS[name], f"flow={flow}", "training.update_ratio=0.1")
     _, reference = tiny_run(f"flow={flow}")
     assert set(summary) == set(reference)
@@ -54,18 +49,16 @@ def test_every_algorithm_trains_all_that_it_has(name: str, flow: str, tiny_run: 
 
 
 @pytest.mark.parametrize("name", ["td3", "ppo"])
-def test_every_algorithm_goes_on_bit_by_bit(
-    name: str, make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_every_algorithm_goes_on_bit_by_bit(name: str, tmp_path: Path) -> None:
     overrides = [*TINY, *ALGORITHMS[name], "checkpoint.interval=64", "training.update_ratio=0.1"]
-    config = make_config(*overrides)
+    config = compose_config(*overrides)
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "stopped", 150)
-    go_on(tmp_path / "stopped", make_config=make_config)
+    go_on(tmp_path / "stopped")
     assert not differences(tmp_path / "whole", tmp_path / "stopped")
 
 
-def test_the_actor_of_td3_follows_every_second_update(tiny_run: Run) -> None:
+def test_the_actor_of_td3_follows_every_second_update(tiny_run: TinyRun) -> None:
     one = tiny_run("algorithm=td3", "training.update_ratio=0.0105")[0].load_checkpoint()["loss"]
     none = tiny_run("algorithm=td3", "training.update_ratio=0")[0].load_checkpoint()["loss"]
     changed = {key.split(".")[0] for key in one if not torch.equal(one[key], none[key])}
@@ -83,9 +76,9 @@ MIXED = {
 
 @pytest.mark.parametrize(("overrides", "message"), MIXED.values(), ids=MIXED)
 def test_what_does_not_belong_together_is_refused(
-    overrides: list[str], message: str, make_config: MakeConfig, tmp_path: Path
+    overrides: list[str], message: str, tmp_path: Path
 ) -> None:
     folder = RunFolder.create(tmp_path / "run")
     with pytest.raises(ValueError, match=message):
-        train(make_config(*overrides), folder)
+        train(compose_config(*overrides), folder)
     assert not list(folder.path.iterdir())

@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from rerun.chunk import RrdReader
 from tensordict import TensorDictBase
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.callbacks import show_episodes
 from cnfp_torchrl.training.episodes import record_episode
@@ -31,9 +32,10 @@ from cnfp_torchrl.training.train import train
 from cnfp_torchrl.visual.rerun import Recording, RunningViewer
 from tests.visual.rerun.recorded import read
 
+from .conftest import TinyRun
+
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 FILE = ["visual=file", "visual.samples=16"]
-Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
 Config = Callable[..., DictConfig]
 
 
@@ -54,13 +56,11 @@ def compare(one: RunFolder, other: RunFolder) -> int:
 
 OFF = """
 import sys
-from hydra import compose, initialize_config_dir
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 import cnfp_torchrl.commands.evaluate
-with initialize_config_dir(str(config_directory()), version_base="1.3"):
-    train(compose("train", overrides=sys.argv[2:]), RunFolder.create(sys.argv[1]))
+train(compose_config(*sys.argv[2:]), RunFolder.create(sys.argv[1]))
 assert "rerun" not in sys.modules
 assert "cnfp_torchrl.visual" not in sys.modules
 """
@@ -80,7 +80,7 @@ def test_off_imports_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.rrd"))
 
 
-def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run: Run) -> None:
+def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run: TinyRun) -> None:
     folder, _ = tiny_run(*FILE, "collector.total_frames=400", "training.log_interval=160")
     path = folder.path / "recording.rrd"
     # 16 agents are stepped together: 25 steps of each. Then an episode of 12 steps.
@@ -93,7 +93,7 @@ def test_the_recording_has_each_tenth_step_then_an_episode_and_the_log(tiny_run:
 @pytest.mark.parametrize("flow", ["exact", "squash", "unconstrained"])
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_episodes_of_the_trained_policy_follow_the_training(
-    deterministic: bool, flow: str, tiny_run: Run
+    deterministic: bool, flow: str, tiny_run: TinyRun
 ) -> None:
     chosen = ["visual.episodes=2", f"visual.deterministic={deterministic}", f"flow={flow}"]
     folder, _ = tiny_run(*FILE, *chosen)
@@ -119,7 +119,7 @@ def test_episodes_of_the_trained_policy_follow_the_training(
 
 
 def test_a_stream_that_fails_costs_no_results(
-    tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_run: TinyRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, expected = tiny_run()
 
@@ -136,7 +136,7 @@ def test_a_stream_that_fails_costs_no_results(
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_evaluation_that_fails_costs_neither_checkpoint_nor_recording(
-    error: type[BaseException], tiny_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: type[BaseException], tiny_run: TinyRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise error("no evaluation")
@@ -158,7 +158,7 @@ def test_an_evaluation_that_fails_costs_neither_checkpoint_nor_recording(
     assert steps_of(closed[0], "/explanation") == [0, 160]
 
 
-def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run) -> None:
+def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: TinyRun) -> None:
     unwatched = tiny_run("training.warmup_frames=48")
     one, other, different = (
         tiny_run(*FILE, "training.warmup_frames=48", "visual.every=1", f"seed={seed}")
@@ -191,7 +191,6 @@ def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Run
 def test_what_cannot_be_shown_is_refused_before_anything_is_left(
     overrides: list[str],
     message: str,
-    make_config: Config,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -199,15 +198,15 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_left(
         monkeypatch.delenv(name, raising=False)
     folder = RunFolder.create(tmp_path / "run")
     with pytest.raises(Exception, match=message):
-        train(make_config(*overrides), folder)
+        train(compose_config(*overrides), folder)
     assert not list(folder.path.iterdir())
 
 
-def test_a_recording_is_never_overwritten(make_config: Config, tmp_path: Path) -> None:
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     (folder.path / "recording.rrd").write_text("precious")
     with pytest.raises(FileExistsError, match=r"recording\.rrd exists"):
-        train(make_config(*FILE), folder)
+        train(compose_config(*FILE), folder)
     assert (folder.path / "recording.rrd").read_text() == "precious"
 
 
@@ -229,7 +228,7 @@ def server() -> Iterator[psutil.Popen]:
 
 @pytest.mark.parametrize("fate", [None, signal.SIGSTOP, signal.SIGKILL])
 def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
-    fate: signal.Signals | None, server: psutil.Popen, tiny_run: Run, tmp_path: Path
+    fate: signal.Signals | None, server: psutil.Popen, tiny_run: TinyRun, tmp_path: Path
 ) -> None:
     reference, summary = tiny_run(*FILE, "visual.every=1")
 
@@ -254,7 +253,7 @@ def episode_of(folder: RunFolder, number: int, deterministic: bool) -> list[Tens
     return record_episode(env, actor, settings, number, deterministic=deterministic)
 
 
-def test_an_episode_depends_on_its_seed_alone(tiny_run: Run, tmp_path: Path) -> None:
+def test_an_episode_depends_on_its_seed_alone(tiny_run: TinyRun, tmp_path: Path) -> None:
     folder, _ = tiny_run()
     first, second, again = (episode_of(folder, number, False) for number in (0, 1, 0))
     assert [len(first), len(second)] == [12, 12]
@@ -271,7 +270,7 @@ def test_an_episode_depends_on_its_seed_alone(tiny_run: Run, tmp_path: Path) -> 
     assert words.startswith("Trained policy, stochastic, episode 1, step 7 of 12: **")
 
 
-def test_an_endless_episode_is_cut_off(tiny_run: Run) -> None:
+def test_an_endless_episode_is_cut_off(tiny_run: TinyRun) -> None:
     folder, _ = tiny_run()
     config = folder.load_config()
     env = build_environment(config, batch_size=[2], with_anchor=True)

@@ -5,18 +5,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 import torch
-from omegaconf import DictConfig
 from scipy import stats
 from tensordict import TensorDict
 from torch import Tensor
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.modules import WarmUpPolicy
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.collectors import (
@@ -29,13 +28,12 @@ from cnfp_torchrl.training.collectors import (
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.train import train
 
-MakeConfig = Callable[..., DictConfig]
 AGENTS = 8
 TINY = [f"env.agents={AGENTS}", "+env.base.max_steps=5", "figures=none"]
 
 
-def test_workers_act_at_random_as_long_as_they_are_told_to(make_config: MakeConfig) -> None:
-    config = make_config(*TINY)
+def test_workers_act_at_random_as_long_as_they_are_told_to() -> None:
+    config = compose_config(*TINY)
     env = build_environment(config)
     policy = WarmUpPolicy(build_actor(config, env), 100)
     worker = WorkerPolicy(policy)
@@ -71,8 +69,8 @@ class InThisProcess(WorkerCollector):
         return Running()
 
 
-def test_the_warm_up_is_counted_for_all_workers(make_config: MakeConfig) -> None:
-    config = make_config(*TINY)
+def test_the_warm_up_is_counted_for_all_workers() -> None:
+    config = compose_config(*TINY)
     env = build_environment(config)
     policy = WarmUpPolicy(build_actor(config, env), 40)
     options = {"workers": 2, "frames_per_batch": AGENTS, "total_frames": 96}
@@ -98,10 +96,10 @@ KINDS = ["multi_sync", "multi_async", "ray"]
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Ray and of processes that it leaves to be collected
 @pytest.mark.parametrize("kind", KINDS)
-def test_weights_arrive_in_the_workers(kind: str, make_config: MakeConfig) -> None:
+def test_weights_arrive_in_the_workers(kind: str) -> None:
     if kind == "ray":
         pytest.importorskip("ray", reason="of the extra 'ray'")
-    config = make_config(*TINY, f"collector={kind}", "collector.total_frames=192")
+    config = compose_config(*TINY, f"collector={kind}", "collector.total_frames=192")
     env = build_environment(config)
     actor = build_actor(config, env)
     policy = WarmUpPolicy(actor, 4 * AGENTS)
@@ -135,10 +133,10 @@ def test_weights_arrive_in_the_workers(kind: str, make_config: MakeConfig) -> No
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", KINDS)
-def test_training(kind: str, make_config: MakeConfig, tmp_path: Path) -> None:
+def test_training(kind: str, tmp_path: Path) -> None:
     if kind == "ray":
         pytest.importorskip("ray", reason="of the extra 'ray'")
-    config = make_config(
+    config = compose_config(
         *TINY,
         f"collector={kind}",
         "collector.total_frames=320",
@@ -153,9 +151,9 @@ def test_training(kind: str, make_config: MakeConfig, tmp_path: Path) -> None:
     assert set(summary["violations"].values()) == {0}
 
 
-def ends_of_episodes(kind: str, make_config: MakeConfig, *, seed: int, shift: float = 0) -> Tensor:
+def ends_of_episodes(kind: str, *, seed: int, shift: float = 0) -> Tensor:
     """Return the returns and last actions of a fixed policy's episodes, ``(episodes, 3)``."""
-    config = make_config(
+    config = compose_config(
         "env.agents=64",
         "+env.base.max_steps=5",
         f"collector={kind}",
@@ -189,12 +187,12 @@ def least_likely(first: Tensor, second: Tensor) -> float:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_workers_collect_what_one_process_does(make_config: MakeConfig) -> None:
-    single = ends_of_episodes("single", make_config, seed=0)
+def test_workers_collect_what_one_process_does() -> None:
+    single = ends_of_episodes("single", seed=0)
     assert len(single) == 6400 // 5
-    assert least_likely(single, ends_of_episodes("single", make_config, seed=1, shift=0.5)) < 1e-4
+    assert least_likely(single, ends_of_episodes("single", seed=1, shift=0.5)) < 1e-4
     for kind, seed in (("multi_sync", 2), ("multi_async", 4)):
-        several = ends_of_episodes(kind, make_config, seed=seed)
+        several = ends_of_episodes(kind, seed=seed)
         assert len(several) >= 6400 // 5 - 64
         assert len(several.unique(dim=0)) == len(several)
         assert least_likely(single, several) > 1e-3, kind

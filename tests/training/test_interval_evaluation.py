@@ -1,18 +1,17 @@
 """Evaluation while training goes on."""
 
 import csv
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 
-Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
+from .conftest import TinyRun
 
 EVALUATED = ["evaluation.interval=50", "evaluation.interval_episodes=3"]
 
@@ -23,7 +22,7 @@ def rows(folder: RunFolder, name: str) -> list[tuple[int, float]]:
         return [(int(step), float(value)) for step, value in csv.reader(file)]
 
 
-def test_training_goes_the_same_way_with_and_without(tiny_run: Run) -> None:
+def test_training_goes_the_same_way_with_and_without(tiny_run: TinyRun) -> None:
     folder, summary = tiny_run(*EVALUATED)
     without, plain = tiny_run("evaluation.interval=null")
     # Batches have 16 steps: the first ones that end beyond 50, 100 and 150, and the last one.
@@ -34,7 +33,7 @@ def test_training_goes_the_same_way_with_and_without(tiny_run: Run) -> None:
     assert all(torch.equal(trained[name], expected[name]) for name in expected)
 
 
-def test_what_is_logged_is_what_the_summary_says(tiny_run: Run) -> None:
+def test_what_is_logged_is_what_the_summary_says(tiny_run: TinyRun) -> None:
     folder, summary = tiny_run(*EVALUATED)
     history = summary["evaluations_in_training"]
     for name, key in {"return": "return_mean", "score": "score"}.items():
@@ -47,7 +46,7 @@ def test_what_is_logged_is_what_the_summary_says(tiny_run: Run) -> None:
 
 
 def test_the_best_policy_is_that_of_the_best_evaluation(
-    tiny_run: Run, monkeypatch: pytest.MonkeyPatch
+    tiny_run: TinyRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from cnfp_torchrl.training import train as training
 
@@ -74,10 +73,8 @@ def test_the_best_policy_is_that_of_the_best_evaluation(
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", 0])
-def test_an_unknown_device_is_refused_with_those_there_are(
-    device: Any, make_config: Callable[..., DictConfig], tmp_path: Path
-) -> None:
+def test_an_unknown_device_is_refused_with_those_there_are(device: Any, tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     with pytest.raises(ValueError, match=r"^device: expected a device of this machine: cpu"):
-        train(make_config(f"device={device}"), folder)
+        train(compose_config(f"device={device}"), folder)
     assert not list(folder.path.iterdir())

@@ -1,18 +1,15 @@
 """A run as a function: observation in, allowed action out."""
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from cnfp_torchrl import Ball, GeometryTransform, constrain_env, make_constrained_actor
-from cnfp_torchrl.configuration import config_directory, foreign_packages
+from cnfp_torchrl.configuration import compose_config, foreign_packages
 from cnfp_torchrl.geometry import GeometryError
 from cnfp_torchrl.modules import ConstraintViolationError
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
@@ -27,9 +24,7 @@ from .conftest import TINY
 
 @pytest.fixture(scope="module", params=["exact", "projection", "unconstrained"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        flow = f"flow={request.param}"
-        config = compose("train", overrides=[*TINY, flow, "evaluation.episodes=1"])
+    config = compose_config(*TINY, f"flow={request.param}", "evaluation.episodes=1")
     folder = RunFolder.create(tmp_path_factory.mktemp("run") / "run")
     train(config, folder)
     return folder
@@ -121,10 +116,7 @@ def test_the_summary_says_where_the_run_came_from(run: RunFolder) -> None:
     assert commit is None or len(commit.partition(",")[0]) == 40
 
 
-MakeConfig = Callable[..., DictConfig]
-
-
-def test_whoever_reads_a_run_is_told_whom_to_trust(make_config: MakeConfig) -> None:
-    assert foreign_packages(make_config()) == []
-    own = make_config("env.base._target_=my_pendulum.make_env")
+def test_whoever_reads_a_run_is_told_whom_to_trust() -> None:
+    assert foreign_packages(compose_config()) == []
+    own = compose_config("env.base._target_=my_pendulum.make_env")
     assert foreign_packages(own) == ["my_pendulum."]

@@ -5,18 +5,16 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from rerun.chunk import RrdReader
 from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, TransformedEnv
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.checkpoints import CheckpointError, Checkpoints
 from cnfp_torchrl.training.environment_state import EpisodesBeginAnewWarning
 from cnfp_torchrl.training.interruption import (
@@ -31,10 +29,9 @@ from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BrokenCheckpointWarning
 from cnfp_torchrl.training.train import train
 from experiments.resume import differences
+from tests.payload import Payload
 
 from .conftest import TINY as SHORT
-
-MakeConfig = Callable[..., DictConfig]
 
 TINY = [*SHORT, "evaluation.episodes=1", "training.update_ratio=0.1", "checkpoint.interval=64"]
 
@@ -59,9 +56,12 @@ def run_until(config: DictConfig, path: Path, frames: int, *, resume: bool = Fal
             train(config, folder, resume=resume)
 
 
-def go_on(path: Path, *overrides: str, make_config: MakeConfig) -> dict[str, Any]:
+def go_on(
+    path: Path,
+    *overrides: str,
+) -> dict[str, Any]:
     folder = RunFolder.resume(path)
-    config = resumed_config(folder, make_config(*overrides), overrides, [__name__])
+    config = resumed_config(folder, compose_config(*overrides), overrides, [__name__])
     return train(config, folder, resume=True)
 
 
@@ -69,28 +69,25 @@ def go_on(path: Path, *overrides: str, make_config: MakeConfig) -> dict[str, Any
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that was not stopped."""
     path = tmp_path_factory.mktemp("runs") / "whole"
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=TINY)
+    config = compose_config(*TINY)
     train(config, RunFolder.create(path))
     return path
 
 
 # Before the first state; between two; in the last step.
 @pytest.mark.parametrize("killed_at", [48, 160, 192])
-def test_a_killed_run_ends_as_one_that_was_not(
-    killed_at: int, whole: Path, make_config: MakeConfig, tmp_path: Path
-) -> None:
-    run_until(make_config(*TINY), tmp_path / "killed", killed_at)
-    go_on(tmp_path / "killed", make_config=make_config)
+def test_a_killed_run_ends_as_one_that_was_not(killed_at: int, whole: Path, tmp_path: Path) -> None:
+    run_until(compose_config(*TINY), tmp_path / "killed", killed_at)
+    go_on(tmp_path / "killed")
     assert not differences(whole, tmp_path / "killed")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
-def test_a_run_on_a_gpu_goes_on_there(make_config: MakeConfig, tmp_path: Path) -> None:
-    config = make_config(*TINY, "device=cuda")
+def test_a_run_on_a_gpu_goes_on_there(tmp_path: Path) -> None:
+    config = compose_config(*TINY, "device=cuda")
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "killed", 160)
-    go_on(tmp_path / "killed", make_config=make_config)
+    go_on(tmp_path / "killed")
     assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
@@ -104,11 +101,11 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_runs_of_all_kinds_go_on(kind: str, make_config: MakeConfig, tmp_path: Path) -> None:
-    config = make_config(*TINY, *OTHERS[kind])
+def test_runs_of_all_kinds_go_on(kind: str, tmp_path: Path) -> None:
+    config = compose_config(*TINY, *OTHERS[kind])
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "killed", 160)
-    go_on(tmp_path / "killed", make_config=make_config)
+    go_on(tmp_path / "killed")
     assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
@@ -119,35 +116,32 @@ def gymnasium_env(name: str) -> EnvBase:
     return TransformedEnv(env, DoubleToFloat(in_keys=["observation"], out_keys=["observation"]))
 
 
-def of_gymnasium(name: str, make_config: MakeConfig) -> DictConfig:
-    config = make_config(*TINY, "flow=unconstrained")
+def of_gymnasium(name: str) -> DictConfig:
+    config = compose_config(*TINY, "flow=unconstrained")
     base = {"_target_": f"{__name__}.gymnasium_env", "name": name}
     config.env = {"agents": 16, "base": base, "geometry": {}}
     return config
 
 
-def test_episodes_of_mujoco_go_on(make_config: MakeConfig, tmp_path: Path) -> None:
-    config = of_gymnasium("Hopper-v5", make_config)
+def test_episodes_of_mujoco_go_on(tmp_path: Path) -> None:
+    config = of_gymnasium("Hopper-v5")
     train(config, RunFolder.create(tmp_path / "whole"))
     run_until(config, tmp_path / "killed", 160)
-    go_on(tmp_path / "killed", make_config=make_config)
+    go_on(tmp_path / "killed")
     assert not differences(tmp_path / "whole", tmp_path / "killed")
 
 
-def test_where_an_environment_gives_no_state_its_episodes_begin_anew(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
-    config = of_gymnasium("Pendulum-v1", make_config)
+def test_where_an_environment_gives_no_state_its_episodes_begin_anew(tmp_path: Path) -> None:
+    config = of_gymnasium("Pendulum-v1")
     run_until(config, tmp_path / "killed", 160)
     with pytest.warns(EpisodesBeginAnewWarning, match=r"step 128 begin anew: .*GymEnv"):
-        assert go_on(tmp_path / "killed", make_config=make_config)["steps"] == 192
+        assert go_on(tmp_path / "killed")["steps"] == 192
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_stops_a_run_when_it_is_saved(
     number: int,
     whole: Path,
-    make_config: MakeConfig,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -163,24 +157,24 @@ def test_a_signal_stops_a_run_when_it_is_saved(
     with monkeypatch.context() as patch:
         patch.setattr(Metrics, "add_steps", counting)
         with pytest.raises(TrainingInterrupted, match="step 112") as stopped:
-            train(make_config(*TINY), folder)
+            train(compose_config(*TINY), folder)
     assert f"resume={tmp_path / 'stopped'}" in str(stopped.value)
     assert handlers == [signal.getsignal(each) for each in STOP_SIGNALS]
-    go_on(folder.path, make_config=make_config)
+    go_on(folder.path)
     assert not differences(whole, folder.path)
 
 
 def test_a_signal_ends_the_evaluation_at_once(
-    whole: Path, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = RunFolder.create(tmp_path / "stopped")
     evaluation = "cnfp_torchrl.training.train.evaluate_seeded"
     with monkeypatch.context() as patch:
         patch.setattr(evaluation, lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
         with pytest.raises(TrainingInterrupted, match=r"step 192; go on with: .*stopped"):
-            train(make_config(*TINY), folder)
+            train(compose_config(*TINY), folder)
     assert not folder.is_finished
-    go_on(folder.path, make_config=make_config)
+    go_on(folder.path)
     assert not differences(whole, folder.path)
 
 
@@ -201,25 +195,31 @@ def test_workers_live_through_the_signals_that_stop_a_run() -> None:
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
 
 
-def test_a_finished_run_can_be_extended(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_a_finished_run_can_be_extended(tmp_path: Path) -> None:
     longer = "collector.total_frames=288"
-    train(make_config(*TINY, longer), RunFolder.create(tmp_path / "whole"))
-    train(make_config(*TINY), RunFolder.create(tmp_path / "extended"))
+    train(compose_config(*TINY, longer), RunFolder.create(tmp_path / "whole"))
+    train(compose_config(*TINY), RunFolder.create(tmp_path / "extended"))
     before = (tmp_path / "extended" / "summary.json").read_text()
     with pytest.raises(ValueError, match="finished with 192 steps"):
-        go_on(tmp_path / "extended", make_config=make_config)
+        go_on(tmp_path / "extended")
     with pytest.raises(ValueError, match="at least the 192 steps"):
-        go_on(tmp_path / "extended", "collector.total_frames=96", make_config=make_config)
+        go_on(
+            tmp_path / "extended",
+            "collector.total_frames=96",
+        )
     assert (tmp_path / "extended" / "summary.json").read_text() == before
-    go_on(tmp_path / "extended", longer, make_config=make_config)
+    go_on(
+        tmp_path / "extended",
+        longer,
+    )
     assert not differences(tmp_path / "whole", tmp_path / "extended")
     assert RunFolder(tmp_path / "extended").load_settings()["collector"]["total_frames"] == 288
 
 
 @pytest.fixture
-def stopped(make_config: MakeConfig, tmp_path: Path) -> Path:
+def stopped(tmp_path: Path) -> Path:
     """The folder of a run that was killed at step 160, with states at 64 and 128."""
-    run_until(make_config(*TINY), tmp_path / "stopped", 160)
+    run_until(compose_config(*TINY), tmp_path / "stopped", 160)
     return tmp_path / "stopped"
 
 
@@ -227,66 +227,53 @@ REFUSED = ["seed=3", "flow=squash", "env.agents=8", "optim.lr=0.1", "experiment=
 
 
 @pytest.mark.parametrize("override", REFUSED)
-def test_what_would_change_a_run_is_refused(
-    override: str, make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_what_would_change_a_run_is_refused(override: str, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    folder.save_config(make_config(*TINY))
+    folder.save_config(compose_config(*TINY))
     with pytest.raises(ValueError, match=override.partition("=")[0]):
-        resumed_config(folder, make_config(override), [override])
+        resumed_config(folder, compose_config(override), [override])
 
 
-def test_what_is_as_it_was_may_be_given_again(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_what_is_as_it_was_may_be_given_again(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    folder.save_config(make_config(*TINY, "seed=3", "flow=squash"))
+    folder.save_config(compose_config(*TINY, "seed=3", "flow=squash"))
     given = ["seed=3", "flow=squash", "visual=file", "checkpoint.interval=7", "resume=x"]
-    config = resumed_config(folder, make_config(*given), given)
+    config = resumed_config(folder, compose_config(*given), given)
     assert (config.seed, config.checkpoint.interval, config.visual.every) == (3, 7, 10)
     assert config.collector.total_frames == 192
 
 
-def test_a_strangers_run_is_not_trained_further(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_a_strangers_run_is_not_trained_further(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    config = make_config(*TINY)
+    config = compose_config(*TINY)
     config.optim._target_ = "os.system"
     folder.save_config(config)
     with pytest.raises(PermissionError, match=r"optim\._target_"):
-        resumed_config(folder, make_config(), [])
-
-
-class Payload:
-    """What a stranger's state could carry: code that runs when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
+        resumed_config(folder, compose_config(), [])
 
 
 @pytest.mark.parametrize("kind", ["state", "transitions"])
-def test_a_strangers_state_runs_no_code(
-    kind: str, stopped: Path, make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_a_strangers_state_runs_no_code(kind: str, stopped: Path, tmp_path: Path) -> None:
     for file in (stopped / STATES).glob(f"{kind}-*"):
         torch.save({"metrics": Payload(tmp_path / "owned")}, file)
     with pytest.raises(CheckpointError, match=kind):
-        go_on(stopped, make_config=make_config)
+        go_on(stopped)
     assert not (tmp_path / "owned").exists()
 
 
 def test_an_older_state_serves_where_the_newest_is_broken(
-    whole: Path, stopped: Path, make_config: MakeConfig
+    whole: Path,
+    stopped: Path,
 ) -> None:
     newest = max((stopped / STATES).glob("state-*"))
     newest.write_bytes(newest.read_bytes()[:1000])
     with pytest.warns(BrokenCheckpointWarning, match=r"state-0*128\.pt.*goes on at step 64"):
-        go_on(stopped, make_config=make_config)
+        go_on(stopped)
     assert not differences(whole, stopped)
 
 
 def test_on_a_full_disk_the_states_before_stay(
-    whole: Path, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = RunFolder.create(tmp_path / "full")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -303,24 +290,24 @@ def test_on_a_full_disk_the_states_before_stay(
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoints, "save", save_on_a_full_disk)
         with pytest.raises(CheckpointError, match=r"state-0*128.*room"):
-            train(make_config(*TINY), folder)
+            train(compose_config(*TINY), folder)
     states = (folder.path / STATES).glob("*state-*")
     assert [path.name for path in states] == ["state-000000000064.pt"]
-    go_on(folder.path, make_config=make_config)
+    go_on(folder.path)
     assert not differences(whole, folder.path)
 
 
-def test_a_folder_that_cannot_be_written_to_is_named(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     (folder.path / STATES).write_text("not a folder")
     with pytest.raises(CheckpointError, match=rf"{STATES}.*could not be written"):
-        train(make_config(*TINY), folder)
+        train(compose_config(*TINY), folder)
 
 
-def test_states_are_few_and_can_be_done_without(make_config: MakeConfig, tmp_path: Path) -> None:
-    short = make_config(*TINY[:-1], "checkpoint.interval=32", "replay_buffer.storage.max_size=48")
+def test_states_are_few_and_can_be_done_without(tmp_path: Path) -> None:
+    short = compose_config(
+        *TINY[:-1], "checkpoint.interval=32", "replay_buffer.storage.max_size=48"
+    )
     folder = RunFolder.create(tmp_path / "kept")
     train(short, folder)
     names = sorted(path.name for path in (folder.path / STATES).iterdir())
@@ -329,14 +316,14 @@ def test_states_are_few_and_can_be_done_without(make_config: MakeConfig, tmp_pat
     assert names == [f"{kind}-{step:012d}.pt" for kind, steps in kept.items() for step in steps]
     for setting in ("checkpoint.interval=null", "checkpoint.keep_last=false"):
         folder = RunFolder.create(tmp_path / setting)
-        train(make_config(*TINY, setting), folder)
+        train(compose_config(*TINY, setting), folder)
         assert not (folder.path / STATES).exists()
 
 
-def test_a_recording_goes_on_in_a_file_of_its_own(make_config: MakeConfig, tmp_path: Path) -> None:
-    config = make_config(*TINY, "visual=file", "visual.samples=8")
+def test_a_recording_goes_on_in_a_file_of_its_own(tmp_path: Path) -> None:
+    config = compose_config(*TINY, "visual=file", "visual.samples=8")
     run_until(config, tmp_path / "run", 160)
-    go_on(tmp_path / "run", make_config=make_config)
+    go_on(tmp_path / "run")
     first, second = (
         {
             step

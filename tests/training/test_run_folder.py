@@ -17,21 +17,13 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_actor, build_environment, load_actor
 from cnfp_torchrl.training.checkpoints import CheckpointError
 from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, CONFIG, SUMMARY, RunFolder
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
-
-
-class Payload:
-    """What a stranger's checkpoint could carry: code that runs when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Path.touch, (self.path,)
+from tests.payload import Payload
 
 
 @pytest.mark.parametrize("held", [CONFIG, CHECKPOINT, SUMMARY])
@@ -155,9 +147,9 @@ def saved(content: object) -> bytes:
 
 
 @pytest.fixture
-def whole(make_config: Callable[..., DictConfig], tmp_path: Path) -> RunFolder:
+def whole(tmp_path: Path) -> RunFolder:
     """A run's folder with an untrained actor."""
-    config = make_config()
+    config = compose_config()
     folder = RunFolder.create(tmp_path / "run")
     folder.save_config(config)
     folder.save_checkpoint(actor=build_actor(config, build_environment(config)))
@@ -204,10 +196,8 @@ def test_a_broken_checkpoint_is_refused_by_a_sentence(kind: str, whole: RunFolde
     assert "weights_only" not in str(caught.value)
 
 
-def test_a_checkpoint_of_other_sizes_is_refused(
-    whole: RunFolder, make_config: Callable[..., DictConfig]
-) -> None:
-    config = make_config("network.hidden=[8]")
+def test_a_checkpoint_of_other_sizes_is_refused(whole: RunFolder) -> None:
+    config = compose_config("network.hidden=[8]")
     whole.save_checkpoint(actor=build_actor(config, build_environment(config)))
     with pytest.raises(ValueError, match=r"(?s)checkpoint\.pt: .*has another 'actor'.*size"):
         load(whole)

@@ -1,19 +1,18 @@
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from hydra.errors import ConfigCompositionException
-from omegaconf import DictConfig
 
+from cnfp_torchrl.configuration import compose_config, config_directory
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 
-Run = Callable[..., tuple[RunFolder, dict[str, Any]]]
+from .conftest import TINY, TinyRun
 
 
 def form(value: Any) -> Any:
@@ -29,37 +28,51 @@ def told(summary: dict[str, Any]) -> dict[str, Any]:
     return {key: told(each) if isinstance(each, dict) else each for key, each in kept.items()}
 
 
-SAFE = ("exact", "gauge", "radial", "projection")
-
 ENTROPIES = [
     *itertools.product(
         ["exact", "gauge", "radial", "squash", "unconstrained"], ["reference", "action"]
     ),
     ("projection", "reference"),
 ]
+RUNS = {
+    f"{flow}, {entropy} entropy": [f"flow={flow}", f"loss.entropy={entropy}"]
+    for flow, entropy in ENTROPIES
+} | {
+    path.stem: [f"experiment={path.stem}"] for path in config_directory().glob("experiment/*.yaml")
+}
 
 
-@pytest.mark.parametrize(("flow", "entropy"), ENTROPIES)
-def test_every_flow_trains_and_reports_in_one_form(flow: str, entropy: str, tiny_run: Run) -> None:
-    folder, summary = tiny_run(f"flow={flow}", f"loss.entropy={entropy}")
-    _, reference = tiny_run()
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The summary of a run of the default configuration."""
+    folder = RunFolder.create(tmp_path_factory.mktemp("runs") / "reference")
+    return train(compose_config(*TINY), folder)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_flow_and_experiment_trains_and_reports_in_one_form(
+    name: str, reference: dict[str, Any], tiny_run: TinyRun
+) -> None:
+    folder, summary = tiny_run(*RUNS[name])
     assert form(told(summary)) == form(told(reference))
     assert json.loads((folder.path / "summary.json").read_text()) == summary
     assert summary["steps"] == 192
     assert list(summary["violations"]) == ["obstacle", "battery"]
-    if flow in SAFE:
+    is_safe = name.startswith(("exact", "gauge", "radial", "projection"))
+    if is_safe:
         assert summary["violations"] == {"obstacle": 0, "battery": 0}
+    elif not name.startswith("squash"):
+        assert sum(summary["violations"].values()) > 0
     # Whether a constraint holds is told where the flow needs to know.
     evaluated = summary["evaluation"]["stochastic"]["steps"]
     for name, counts in summary["constraints"].items():
         assert sum(counts["steps"].values()) == 192 + 2 * evaluated
         assert counts["violations_while"]["active"] == 0, name
-    is_told = ["battery", "obstacle"] if flow in SAFE else []
-    assert sorted(summary["constraints"]) == is_told
+    assert sorted(summary["constraints"]) == (["battery", "obstacle"] if is_safe else [])
 
 
 def test_violations_are_those_the_environment_counts(
-    tiny_run: Run, monkeypatch: pytest.MonkeyPatch
+    tiny_run: TinyRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # An unconstrained agent in a small arena breaks rules at once; count them beside the trainer.
     counted = torch.zeros(2)
@@ -77,13 +90,13 @@ def test_violations_are_those_the_environment_counts(
     assert summary["violations"]["obstacle"] > 0
 
 
-def test_the_order_is_that_of_the_environments_geometry(tiny_run: Run) -> None:
+def test_the_order_is_that_of_the_environments_geometry(tiny_run: TinyRun) -> None:
     assert tiny_run()[1]["order"] == ["battery", "obstacle"]
     assert tiny_run("~env.geometry.battery")[1]["order"] == ["obstacle"]
     assert tiny_run("env.order=[obstacle,battery]")[1]["order"] == ["obstacle", "battery"]
 
 
-def test_training_changes_actor_critic_and_temperature(tiny_run: Run) -> None:
+def test_training_changes_actor_critic_and_temperature(tiny_run: TinyRun) -> None:
     states = [
         tiny_run(f"training.update_ratio={ratio}")[0].load_checkpoint()["loss"]
         for ratio in (0.0, 0.1)
@@ -95,13 +108,13 @@ def test_training_changes_actor_critic_and_temperature(tiny_run: Run) -> None:
         assert any(not torch.equal(states[0][name], states[1][name]) for name in floating), part
 
 
-def test_the_same_seed_gives_the_same_run(tiny_run: Run) -> None:
+def test_the_same_seed_gives_the_same_run(tiny_run: TinyRun) -> None:
     first, second, other = (tiny_run(f"seed={seed}")[1]["return_mean"] for seed in (3, 3, 4))
     assert first == second
     assert first != other
 
 
-def test_metrics_reach_every_logger(tiny_run: Run) -> None:
+def test_metrics_reach_every_logger(tiny_run: TinyRun) -> None:
     folder, _ = tiny_run("logger=csv_tensorboard", "env.base.max_steps=4")
     scalars = folder.path / "metrics" / "scalars"
     expected = ["train/return", "violations/obstacle", "violations/battery", "loss/qvalue"]
@@ -114,7 +127,7 @@ def test_metrics_reach_every_logger(tiny_run: Run) -> None:
     assert list((folder.path / "tensorboard").glob("events.out.tfevents*"))
 
 
-def test_no_logger_is_fine(tiny_run: Run) -> None:
+def test_no_logger_is_fine(tiny_run: TinyRun) -> None:
     folder, _ = tiny_run("logger=none")
     assert {path.name for path in folder.path.iterdir()} == {
         "config.yaml",
@@ -144,7 +157,6 @@ def test_no_logger_is_fine(tiny_run: Run) -> None:
 def test_bad_configuration_is_refused_before_anything_runs(
     override: str,
     message: str,
-    make_config: Callable[..., DictConfig],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -154,20 +166,18 @@ def test_bad_configuration_is_refused_before_anything_runs(
     monkeypatch.setattr(PointNavEnv, "_step", no_step)
     folder = RunFolder.create(tmp_path / "run")
     with pytest.raises(Exception, match=message):
-        train(make_config(*override.split()), folder)
+        train(compose_config(*override.split()), folder)
     assert not list(folder.path.iterdir())
 
 
 @pytest.mark.parametrize(
     "override", ["flow=perfect", "env/obstacle=visble", "env.oder=[battery]", "sed=1"]
 )
-def test_unknown_configuration_is_refused(
-    override: str, make_config: Callable[..., DictConfig]
-) -> None:
+def test_unknown_configuration_is_refused(override: str) -> None:
     with pytest.raises(ConfigCompositionException):
-        make_config(override)
+        compose_config(override)
 
 
-def test_a_diverged_run_fails_loudly(tiny_run: Run) -> None:
+def test_a_diverged_run_fails_loudly(tiny_run: TinyRun) -> None:
     with pytest.raises((FloatingPointError, ValueError), match=r"nan|inf"):
         tiny_run("optim.lr=1e30", "training.update_ratio=1")

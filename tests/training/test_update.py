@@ -7,18 +7,19 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.storage import prepare_buffer
 from cnfp_torchrl.training.train import train
 from cnfp_torchrl.training.update import Update
 from tests.host_reads import HostReads
+
+from .conftest import TINY
 
 EXPERIMENTS = ["exact", "exact_action_entropy", "unconstrained", "lagrangian"]
 
@@ -28,8 +29,7 @@ def prepared(
 ) -> tuple[Update, TensorDictReplayBuffer]:
     """Return the update of an experiment, and a buffer of transitions."""
     overrides = [f"experiment={experiment}", "network.hidden=[8]", "replay_buffer.batch_size=32"]
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=overrides)
+    config = compose_config(*overrides)
     torch.manual_seed(0)
     env = build_environment(config)
     actor = build_actor(config, env)
@@ -136,17 +136,6 @@ def test_compiled_steps_are_the_eager_ones(experiment: str, fresh_compiler: None
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_run_trains_compiled(tmp_path: Path, fresh_compiler: None) -> None:
-    overrides = [
-        "compile=true",
-        "collector.total_frames=192",
-        "training.warmup_frames=96",
-        "training.update_ratio=0.05",
-        "training.log_interval=64",
-        "evaluation.episodes=4",
-        "+env.base.max_steps=12",
-        "figures=none",
-    ]
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", overrides=overrides)
+    config = compose_config(*TINY, "compile=true")
     summary = train(config, RunFolder.create(tmp_path / "run"))
     assert sum(summary["violations"].values()) == 0

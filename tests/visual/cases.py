@@ -1,7 +1,8 @@
 """Flow policies in hand-made states."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -73,6 +74,33 @@ def first(sets: Mapping[str, ConstraintSet], count: int) -> dict[str, Constraint
     return dict(list(sets.items())[:count])
 
 
+CASES: dict[str, tuple[dict[str, ConstraintSet], int]] = {
+    "no constraint": ({}, 2),
+    "one": (first(PLANE, 1), 2),
+    "three": (PLANE, 2),
+    "other families": (PLANE_OF_OTHERS, 2),
+    "one is dropped": (CONFLICT, 2),
+    "one is relaxed": (RELAXED, 2),
+    "on a line": (LINE, 1),
+    "in space": (SPACE, 3),
+}
+"""Constraints, and the dimension of the actions."""
+
+
+def flows_in_cases(*flows: str, cases: Iterable[str] = CASES) -> pytest.MarkDecorator:
+    """Parametrize by flow, constraints and dimension; some of the sets have no squash."""
+    without_squash = ("other families", "in space", "one is dropped")
+    return pytest.mark.parametrize(
+        ("flow", "sets", "dim"),
+        [
+            pytest.param(flow, *CASES[name], id=f"{flow}-{name}")
+            for name in cases
+            for flow in flows
+            if flow != "squash" or name not in without_squash
+        ],
+    )
+
+
 def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
     region = Region.build([Box(-torch.ones(dim), torch.ones(dim)), *sets.values()])
     assert region.active is not None
@@ -97,10 +125,10 @@ def make_actor(
     loc: Tensor | None = None,
     scale: Tensor | None = None,
 ) -> SafeProbabilisticTensorDictSequential:
+    loc = torch.zeros(dim) if loc is None else loc
+    scale = torch.ones(dim) if scale is None else scale
     return make_constrained_actor(
-        Gaussian(
-            torch.zeros(dim) if loc is None else loc, torch.ones(dim) if scale is None else scale
-        ),
+        Gaussian(loc, scale),
         spec=Bounded(-torch.ones(dim), torch.ones(dim)),
         bijectors=[ConstraintBijector(name, type(each)) for name, each in sets.items()],
         flow=flow,
@@ -112,9 +140,8 @@ def make_snapshot(
     flow: str = "exact",
     *,
     dim: int = 2,
-    loc: Tensor | None = None,
-    scale: Tensor | None = None,
     samples: int = 200,
+    **gaussian: Tensor,
 ) -> FlowSnapshot:
-    actor = make_actor(sets, flow, dim=dim, loc=loc, scale=scale)
+    actor = make_actor(sets, flow, dim=dim, **gaussian)
     return take_snapshot(actor, make_state(sets, dim), samples=samples)

@@ -11,28 +11,23 @@ from torch.distributions import Independent, Normal
 
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.envs import NOTHING, Map, TaskView
+from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.modules import ProjectionFlow, flow_head
 from cnfp_torchrl.visual import Scene, Setting
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.scene import PRINTED, Detail, base_density, density_limits
 from cnfp_torchrl.visual.snapshot import FlowSnapshot, stage_bijector
 from tests.visual.cases import (
+    CASES,
     CONFLICT,
     LINE,
     PLANE,
-    RELAXED,
     SPACE,
+    flows_in_cases,
     make_actor,
     make_snapshot,
     make_state,
 )
-
-CASES = {
-    "three": (PLANE, 2),
-    "one is dropped": (CONFLICT, 2),
-    "one is relaxed": (RELAXED, 2),
-    "on a line": (LINE, 1),
-}
 
 
 def setting_of(snapshot: FlowSnapshot, view: TaskView = NOTHING) -> Setting:
@@ -46,12 +41,16 @@ def scene_of(snapshot: FlowSnapshot, reach: float | None = None, cells: int = 31
     return Scene(setting, snapshot, Detail(cells))
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
-@pytest.mark.parametrize("case", CASES)
-def test_last_stage_is_the_policys_log_density(case: str, flow: str) -> None:
-    if flow == "squash" and case == "one is dropped":
-        pytest.skip("some of these sets have no squash")
-    sets, dim = CASES[case]
+@flows_in_cases(
+    "exact",
+    "radial",
+    "squash",
+    "unconstrained",
+    cases=[name for name, (_, dim) in CASES.items() if dim <= 2],
+)
+def test_last_stage_is_the_policys_log_density(
+    flow: str, sets: dict[str, ConstraintSet], dim: int
+) -> None:
     actor = make_actor(sets, flow, dim=dim, loc=torch.full((dim,), 0.3))
     step = actor(make_state(sets, dim))
     snapshot = replay_step(actor, step, torch.zeros(1, dim))

@@ -4,26 +4,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.visual import take_snapshot
 from cnfp_torchrl.visual.snapshot import StagedFlow, stage_bijector
-from tests.visual.cases import (
-    CONFLICT,
-    LINE,
-    PLANE,
-    PLANE_OF_OTHERS,
-    RELAXED,
-    SPACE,
-    make_snapshot,
-)
-
-DIMENSIONS = {1: LINE, 2: PLANE, 3: SPACE}
+from tests.visual.cases import CONFLICT, PLANE, RELAXED, flows_in_cases, make_snapshot
 
 
-@pytest.mark.parametrize("flow", ["exact", "radial"])
-@pytest.mark.parametrize("dim", DIMENSIONS)
-def test_exact_flows_stay_inside_after_every_stage(flow: str, dim: int) -> None:
-    snapshot = make_snapshot(DIMENSIONS[dim], flow, dim=dim, samples=2000)
-    assert [stage.name for stage in snapshot.stages] == ["bounds", *DIMENSIONS[dim]]
+@flows_in_cases("exact", "radial")
+def test_exact_flows_stay_inside_after_every_stage(
+    flow: str, sets: dict[str, ConstraintSet], dim: int
+) -> None:
+    snapshot = make_snapshot(sets, flow, dim=dim, samples=2000)
+    assert [stage.name for stage in snapshot.stages] == ["bounds", *sets]
     for index in range(len(snapshot.stages)):
         assert not snapshot.outside(index).any()
 
@@ -91,25 +83,10 @@ def test_batch_of_states_is_refused() -> None:
         take_snapshot(actor, TensorDict({}, [3]))  # type: ignore[arg-type]
 
 
-CASES = {
-    "no constraint": ({}, 2),
-    "three": (PLANE, 2),
-    "other families": (PLANE_OF_OTHERS, 2),
-    "one is dropped": (CONFLICT, 2),
-    "one is relaxed": (RELAXED, 2),
-    "on a line": (LINE, 1),
-    "in space": (SPACE, 3),
-}
-
-
-@pytest.mark.parametrize(
-    "flow", ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
-)
-@pytest.mark.parametrize("case", CASES)
-def test_stages_are_the_flows_up_to_each(case: str, flow: str) -> None:
-    sets, dim = CASES[case]
-    if flow == "squash" and case in ("other families", "in space", "one is dropped"):
-        pytest.skip("some of these sets have no squash")
+@flows_in_cases("exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained")
+def test_stages_are_the_flows_up_to_each(
+    flow: str, sets: dict[str, ConstraintSet], dim: int
+) -> None:
     snapshot = make_snapshot(sets, flow, dim=dim)
     applied = [stage.applied for stage in snapshot.stages]
     staged = StagedFlow(snapshot.head.flow, snapshot.region, applied)

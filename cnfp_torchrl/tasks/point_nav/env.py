@@ -12,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import TaskView
+from cnfp_torchrl.keys import refuse_non_finite
 from cnfp_torchrl.tasks.point_nav.dynamics import (
     CONSTRAINT_NAMES,
     Collision,
@@ -159,12 +160,8 @@ class PointNavEnv(EnvBase):
             raise ValueError(
                 f"action: expected shape {(*self.batch_size, 2)}, given {tuple(action.shape)}"
             )
-        if bool(action.isnan().any()):
-            index = action.isnan().nonzero()[0].tolist()
-            raise ValueError(
-                f"action at index {index}: expected numbers, given nan; look for the policy's "
-                "first NaN (loc, scale, or parameters after a diverged update)"
-            )
+        # As it is clipped: what is infinite becomes a bound.
+        refuse_non_finite("action", action.clamp(-1, 1), "look for the policy's first NaN")
         outcome = self.dynamics.step(self.state, action, self._generator)
         self._enter(outcome.state)
         self.steps = self.steps + 1

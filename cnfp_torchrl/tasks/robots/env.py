@@ -14,7 +14,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cnfp_torchrl.envs import PreviousAction, TaskView
-from cnfp_torchrl.keys import PREVIOUS_ACTION_KEY
+from cnfp_torchrl.keys import PREVIOUS_ACTION_KEY, refuse_non_finite
 from cnfp_torchrl.tasks.robots.judges import Judge
 
 
@@ -134,13 +134,7 @@ class RobotEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        if not bool(action.isfinite().all()):
-            index = (~action.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
-                f"action at index {index}: expected finite numbers, given "
-                f"{action[tuple(index)].item()}; look for the policy's first NaN (loc, scale, or "
-                "parameters after a diverged update)"
-            )
+        refuse_non_finite("action", action, "look for the policy's first NaN")
         actions = action.detach().cpu().reshape(len(self.robots), -1).numpy()
         cost = np.zeros((len(self.robots), len(self.judges)))
         outcomes = []

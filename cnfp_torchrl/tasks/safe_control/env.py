@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cnfp_torchrl.envs import Component, Map, Marks, Polyline, TaskView
+from cnfp_torchrl.keys import refuse_non_finite
 from cnfp_torchrl.tasks.safe_control.judge import barrier_excess, barrier_values
 from cnfp_torchrl.tasks.safe_control.unicycle import Problem, encoded, motion, starts, step_cost
 
@@ -128,13 +129,7 @@ class SafeControlEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        if not bool(action.isfinite().all()):
-            index = (~action.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
-                f"action at index {index}: expected finite numbers, given "
-                f"{action[tuple(index)].item()}; look for the policy's first NaN (loc, scale, or "
-                "parameters after a diverged update)"
-            )
+        refuse_non_finite("action", action, "look for the policy's first NaN")
         control, rows = action.detach().double(), self.state.reshape(-1, 5)
         broken = barrier_excess(self.problem, rows, control.reshape(-1, 2)).amax(-1) > 0
         dt = self.problem.dt

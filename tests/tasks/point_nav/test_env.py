@@ -161,7 +161,7 @@ def test_bad_actions_are_refused(transformed: bool) -> None:
     env = with_transforms(env) if transformed else env
     state = env.reset()
     action = torch.tensor([[0.0, 0.0], [0.0, float("nan")]])
-    with pytest.raises(ValueError, match=r"action at index \[1, 1\]: expected numbers"):
+    with pytest.raises(ValueError, match=r"action at index \[1, 1\]: expected a finite number"):
         env.step(state.clone().set("action", action))
     with pytest.raises(ValueError, match=r"action: expected shape \(2, 2\), given \(2, 3\)"):
         env.step(state.clone().set("action", torch.zeros(2, 3)))

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -12,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.audit import AuditSettings, audit
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config, config_directory
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.tasks.robots import PowerLimit, RateLimit, RobotEnv, robot_with_previous_action
 from cnfp_torchrl.training.agent import build_actor, build_environment
@@ -27,8 +26,7 @@ TASKS = sorted(
 def environment(
     task: str, agents: int
 ) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", [f"env={task}"])
+    config = compose_config(f"env={task}")
     env = build_environment(config, batch_size=[agents], with_anchor=True)
     env.set_seed(0)
     return env, build_actor(config, env)
@@ -147,7 +145,7 @@ def test_bad_arguments_are_refused_by_name() -> None:
         RobotEnv("Pendulum-v1")
     env = robot_with_previous_action("Hopper-v5", [1])
     env.reset()
-    with pytest.raises(ValueError, match=r"action at index \[0, 0\]: expected finite"):
+    with pytest.raises(ValueError, match=r"action at index \[0, 0\]: expected a finite"):
         env.step(TensorDict({"action": torch.full((1, 3), torch.nan)}, [1]))
 
 

@@ -4,13 +4,12 @@ from functools import partial
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl.audit import AuditSettings, audit
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.tasks.safe_control import (
     Problem,
@@ -57,8 +56,7 @@ def environment(
     agents: int, flow: str = "exact"
 ) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
     """Return the shipped environment, with anchors, and an actor of a flow."""
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", ["env=safe_control", f"flow={flow}"])
+    config = compose_config("env=safe_control", f"flow={flow}")
     env = build_environment(config, batch_size=[agents], with_anchor=True)
     env.set_seed(0)
     return env, build_actor(config, env)
@@ -76,7 +74,7 @@ def test_the_environment_moves_and_costs_what_an_episode_does() -> None:
     assert shown["truncated"].all()
     run = episode(PROBLEM, start, nominal_control)
     torch.testing.assert_close(total, run.cost.float(), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match=r"action at index \[0, 1\]: expected finite numbers"):
+    with pytest.raises(ValueError, match=r"action at index \[0, 1\]: expected a finite number"):
         env.step(env.reset().set("action", torch.tensor([[0.0, torch.nan]]).expand(7, 2)))
 
 

@@ -22,36 +22,20 @@ from tests.visual.cases import (
     CONFLICT,
     LINE,
     PLANE,
-    PLANE_OF_OTHERS,
-    RELAXED,
     SPACE,
     Gaussian,
-    first,
+    flows_in_cases,
     make_actor,
     make_snapshot,
     make_state,
 )
 from tests.visual.rerun.recorded import compare, read, record, record_steps
 
-SQUASHABLE = {name: PLANE[name] for name in ("battery", "obstacle")}
-CASES = {
-    "no constraint": ({}, 2),
-    "one": (first(PLANE, 1), 2),
-    "three": (PLANE, 2),
-    "other families": (PLANE_OF_OTHERS, 2),
-    "one is dropped": (CONFLICT, 2),
-    "one is relaxed": (RELAXED, 2),
-    "on a line": (LINE, 1),
-    "in space": (SPACE, 3),
-}
 
-
-@pytest.mark.parametrize("flow", ["exact", "radial", "squash", "unconstrained"])
-@pytest.mark.parametrize("case", CASES)
-def test_any_flow_in_any_action_space(case: str, flow: str, tmp_path: Path) -> None:
-    sets, dim = CASES[case]
-    if flow == "squash" and case in ("other families", "in space", "one is dropped"):
-        pytest.skip("some of these sets have no squash")
+@flows_in_cases("exact", "radial", "squash", "unconstrained")
+def test_any_flow_in_any_action_space(
+    flow: str, sets: dict[str, ConstraintSet], dim: int, tmp_path: Path
+) -> None:
     path = tmp_path / "recording.rrd"
     first_step, second_step = record_steps(path, sets, flow, dim=dim)
     stages = {"squash": list(sets) or ["bounds"], "unconstrained": ["bounds"]}.get(
