@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, GymEnv, TransformedEnv, check_env_specs
+from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv, check_env_specs
 
 from cnfp_torchrl.envs import ConstraintCost, constraint_names
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
@@ -38,10 +38,23 @@ def test_costs_and_their_sum(batch_size: tuple[int, ...], indicators: dict | Non
         assert torch.equal(episode["next", "episode_cost"], total)
 
 
+class Renamed(PointNavEnv):
+    constraint_names = ("wall", "battery")
+
+
 def test_names_through_a_stack() -> None:
     env = TransformedEnv(PointNavEnv(), ConstraintCost())
     assert env.transform.constraint_names == ("obstacle", "battery")
     assert constraint_names(PointNavEnv()) == ("obstacle", "battery")
+    several = SerialEnv(2, PointNavEnv)
+    several.reset()
+    assert constraint_names(TransformedEnv(several, ConstraintCost())) == ("obstacle", "battery")
+    several.close()
+    others = SerialEnv(2, [PointNavEnv, Renamed])
+    others.reset()
+    with pytest.raises(ValueError, match="expected environments with the same constraint_names"):
+        constraint_names(others)
+    others.close()
     with pytest.raises(ValueError, match="expected one that names its constraints"):
         constraint_names(GymEnv("Pendulum-v1"))
     with pytest.raises(RuntimeError, match="expected indicators or an environment"):
