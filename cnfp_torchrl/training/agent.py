@@ -39,6 +39,7 @@ def build_environment(
     device: torch.device | str | None = None,
     with_anchor: bool = False,
     with_penalty: bool = False,
+    compile: bool = False,
 ) -> TransformedEnv:
     """Return the environment of a configuration.
 
@@ -50,6 +51,8 @@ def build_environment(
         with_anchor: publish anchor and active flags also where the flow does not need them.
         with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
             are judged on the reward without it.
+        compile: compute geometry and anchor of a step by a compiled function, where there is an
+            anchor (`constrain_env`).
 
     Raises:
         ValueError: when a geometry is null or has another name than its key, and when there is none
@@ -85,11 +88,20 @@ def build_environment(
         # Without constraints the anchor is the middle of the bounds, from which pictures look.
         return env.append_transform(ConstraintAnchor([])) if with_anchor else env
     order = config.env.get("order")
+    with_anchor = with_anchor or flow.is_safe
     return constrain_env(
         env,
         *geometries,
         order=None if order is None else list(order),
-        with_anchor=with_anchor or flow.is_safe,
+        with_anchor=with_anchor,
+        compile=compile and with_anchor,
+    )
+
+
+def training_environment(config: DictConfig) -> TransformedEnv:
+    """Return the environment that a run trains in, compiled if the run is."""
+    return build_environment(
+        config, device=config.device, with_penalty=True, compile=config.compile
     )
 
 

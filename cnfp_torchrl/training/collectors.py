@@ -19,7 +19,7 @@ from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncColl
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cnfp_torchrl.modules import WarmUpPolicy
-from cnfp_torchrl.training.agent import build_environment
+from cnfp_torchrl.training.agent import training_environment
 from cnfp_torchrl.training.interruption import starting_workers
 
 MakeEnv = Callable[[], EnvBase]
@@ -55,7 +55,7 @@ def _worker_environment(config: Any, worker: int, frames: int) -> TransformedEnv
     seed = composed.seed + worker + frames
     torch.set_num_threads(composed.threads)
     torch.manual_seed(seed + 1)
-    env = build_environment(composed, device=composed.device, with_penalty=True)
+    env = training_environment(composed)
     env.set_seed(seed)
     return env
 

@@ -22,6 +22,7 @@ from cnfp_torchrl.modules import flow_head, guarded
 from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
+    training_environment,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -96,7 +97,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     # Environment, actor, algorithm and collector
     is_saved = saving.interval is not None
     with starting_workers():  # such as those of a ParallelEnv
-        env = build_environment(config, device=config.device, with_penalty=True)
+        env = training_environment(config)
         env.set_seed(config.seed)
         tally = ConstraintTally.of(env)
         actor = build_actor(config, env)

@@ -218,20 +218,20 @@ CONTROLLERS = {
 
 
 def aim(runs: list[dict[str, Any]]) -> list[str]:
-    """Return a sentence on how far our controllers are from the aim."""
-    if not runs:
-        return []
-    objective, broken = median(run["objective"] for run in runs), sum(r["violations"] for r in runs)
-    reached = sum(run["objective"] <= AIM for run in runs)
-    off = f"{objective - AIM:.1f} above" if objective > AIM else "within"
-    tenth = max(1, len(runs[0]["training_cost"]) // 10)
-    before, last = (median(run["training_cost"][-at] for run in runs) for at in (tenth, 1))
-    return [
-        f"With {broken} violations the median of ours is {off} the aim of {AIM:g}, which {reached} "
-        f"of {len(runs)} seeds reach; the cost in training went from {before:.1f} to {last:.1f} "
-        "in the last tenth of the epochs.",
-        "",
-    ]
+    """Return a sentence for each learning rate on how far our controllers are from the aim."""
+    lines = []
+    for rate in sorted({run["rate"] for run in runs}):
+        chosen = [run for run in runs if run["rate"] == rate]
+        objective = median(run["objective"] for run in chosen)
+        broken = sum(run["violations"] for run in chosen)
+        reached = sum(run["objective"] <= AIM for run in chosen)
+        off = f"{objective - AIM:.1f} above" if objective > AIM else f"{AIM - objective:.1f} below"
+        lines += [
+            f"At a rate of {rate:g}, with {broken} violations, the median of ours is {off} the aim "
+            f"of {AIM:g}, which {reached} of {len(chosen)} seeds reach.",
+            "",
+        ]
+    return lines
 
 
 def safe_control_table(runs: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
@@ -248,17 +248,19 @@ def safe_control_table(runs: list[dict[str, Any]], times: dict[str, Any] | None)
         "largest, and the number of barriers beyond 1e-4, means over starts. The aim: an objective "
         "of at most 500 without a violation, no slower than HardNet-Aff.",
         "",
-        "| controller | epochs | seeds | objective | violations | largest excess | barriers beyond "
-        "1e-4 |",
-        "|---|---|---|---|---|---|---|",
+        "| controller | epochs | learning rate | seeds | objective | violations | largest excess "
+        "| barriers beyond 1e-4 |",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    for name, title in CONTROLLERS.items():
-        chosen = [run for run in runs if run["layer"] == name]
-        if not chosen:
-            continue
+    kinds = sorted({(run["rate"], list(CONTROLLERS).index(run["layer"])) for run in runs})
+    for rate, place in kinds:
+        name, title = list(CONTROLLERS.items())[place]
+        chosen = [run for run in runs if (run["layer"], run["rate"]) == (name, rate)]
+        learns = any(run["epochs"] for run in chosen)
         cells = [
             title,
             str(max(run["epochs"] for run in chosen)),
+            f"{rate:g}" if learns else "-",
             str(len(chosen)),
             spread([run["objective"] for run in chosen], 1),
             f"{sum(run['violations'] for run in chosen):,}",

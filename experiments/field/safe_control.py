@@ -1,12 +1,14 @@
 """Train controllers of a unicycle through layers that keep its barriers; keep each result.
 
-    python -m experiments.field.safe_control LAYER SEED [--epochs 100] [--data FOLDER]
+    python -m experiments.field.safe_control LAYER SEED [--epochs 100] [--rate 1e-4] [--data FOLDER]
     python -m experiments.field.safe_control times [--data FOLDER]
 
 LAYER is ``recession``, which is ours, ``hardnet_aff``, re-implemented from its paper (Min and
 Azizan 2024, arXiv 2410.10807), or ``cbf_qp``, the allowed control closest to the nominal one,
 which learns nothing. Network, starts, batches and learning rate are those published:
-6-200-200-2, batches of 100, Adam with 1e-4. ``times`` measures what a step of both takes, in turns.
+6-200-200-2, batches of 100, Adam with 1e-4. In a tenth of the published epochs no layer is done
+learning at that rate; ``--rate`` gives another. ``times`` measures what a step of both takes, in
+turns.
 
 The aim: an objective of at most 500, no violation with zero tolerance, and no more time than
 HardNet-Aff.
@@ -113,14 +115,14 @@ def controller(name: str, problem: Problem, net: nn.Module) -> Callable[[Tensor]
     return partial(ours, ConstraintLayer(name), problem, net)
 
 
-def train(name: str, seed: int, epochs: int) -> dict[str, Any]:
+def train(name: str, seed: int, epochs: int, rate: float) -> dict[str, Any]:
     """Train, test, and return the record."""
     torch.manual_seed(seed)
     problem = Problem()
     states = starts(partial(barrier_values, problem))
     net = network()
     act = controller(name, problem, net)
-    optimizer = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
+    optimizer = torch.optim.Adam(net.parameters(), lr=rate)
     started, curve = time.perf_counter(), []
     for _ in range(epochs):
         costs = []
@@ -138,6 +140,7 @@ def train(name: str, seed: int, epochs: int) -> dict[str, Any]:
         "layer": name,
         "seed": seed,
         "epochs": epochs,
+        "rate": rate,
         "objective": float(tested.cost.mean()),
         "violations": tested.violations,
         "largest_excess": tested.largest,
@@ -199,6 +202,7 @@ def main() -> None:
     parser.add_argument("layer", choices=(*LAYERS, CBF_QP, TIMES))
     parser.add_argument("seed", type=int, nargs="?", help="of network and batches")
     parser.add_argument("--epochs", type=int, default=100)
+    parser.add_argument("--rate", type=float, default=LEARNING_RATE, help="learning rate")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the records")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -211,10 +215,10 @@ def main() -> None:
         given.seed, given.epochs = 0, 0
     if given.seed is None:
         sys.exit(f"SEED: expected a number after {given.layer}")
-    path = folder / given.layer / f"{given.epochs}_epochs_{given.seed}.json"
+    path = folder / given.layer / f"{given.epochs}_epochs_{given.rate:g}_rate_{given.seed}.json"
     if path.exists():
         return
-    record = train(given.layer, given.seed, given.epochs)
+    record = train(given.layer, given.seed, given.epochs, given.rate)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path, exclusive=True) as file:
         file.write(f"{json.dumps(record)}\n".encode())
