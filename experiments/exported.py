@@ -34,8 +34,8 @@ from cnfp_torchrl.installed_versions import installed_versions
 from cnfp_torchrl.training.networks import gaussian_network
 from cnfp_torchrl.whole_file import whole_file, write_json
 from cnfp_torchrl.wrappers.observed_env import ObservedEnv
+from experiments.random_sets import FAMILIES
 from experiments.resume import markdown
-from tests.geometry.cases import FAMILIES
 
 RESULT = Path(__file__).parent / "results" / "exported.md"
 ROWS = RESULT.with_suffix(".json")
