@@ -12,7 +12,7 @@ from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
-STEPS = 6
+STEPS = 4
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
 
 REFINEMENT = 5
@@ -127,7 +127,7 @@ def refined_attempt(
         The attempts in all states, side by side.
     """
     ascent = Ascent(sets, before.anchor, before.upper)
-    if not ascent.sees_all:
+    if not ascent.of.sees_all:
         return further_attempt(sets, depths, before, STEPS).select()
     largest = depths[0].amax(-1)
     for depth in depths[1:]:
