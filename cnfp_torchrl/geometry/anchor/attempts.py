@@ -147,15 +147,13 @@ def select_states(
 def _roomiest(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
-    """Choose the points with the most slack beyond the depth."""
+    """Choose the points with the most slack beyond the largest depth of each set."""
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
-    slacks = [s.row_slacks(stacked) for s in sets]
-    rooms = [(slack - depth).amin(-1) for slack, depth in zip(slacks, depths, strict=True)]
-    room, slack = (
-        torch.stack(torch.broadcast_tensors(*values)).amin(0)
-        for values in (rooms, [slack.amin(-1) for slack in slacks])
-    )
+    slacks = [s.slack(stacked) for s in sets]
+    room, slack = slacks[0] - depths[0].amax(-1), slacks[0]
+    for each, depth in zip(slacks[1:], depths[1:], strict=True):
+        room, slack = torch.minimum(room, each - depth.amax(-1)), torch.minimum(slack, each)
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
     # Not take_along_dim, with which an exported program would be one for a single batch size.
