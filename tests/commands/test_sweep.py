@@ -14,6 +14,7 @@ import pytest
 
 from cnfp_torchrl.commands.sweep import main as sweep_command
 from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
+from tests.entry_points import run_command
 
 TINY = [
     "collector.total_frames=96",
@@ -28,17 +29,6 @@ TINY = [
 ]
 
 
-def run(command: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", f"cnfp_torchrl.commands.{command}", *arguments],
-        cwd=cwd,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 def table(folder: Path) -> list[dict[str, str]]:
     with (folder / "sweep.csv").open() as file:
         return list(csv.DictReader(file))
@@ -48,7 +38,7 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     sweep = tmp_path / "a=1,[b] c"
     broken = ["optim.lr=1e30,0.001", "training.update_ratio=1"]
     arguments = ["-m", *TINY, *broken, f"hydra.sweep.dir='{sweep}'"]
-    done = run("train", *arguments, cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", *arguments)
     assert done.returncode == 1
     first, second = table(sweep)
     # As soon as it has failed, and not behind the others.
@@ -61,7 +51,7 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert first["state"] in done.stdout
     # What refuses to go on with a complete run says nothing of it.
     complete = sweep / second["folder"]
-    refused = run("train", f"resume={complete}", cwd=tmp_path)
+    refused = run_command(tmp_path, "cnfp-train", f"resume={complete}")
     assert refused.returncode == 1
     assert "has finished with 96 steps" in refused.stderr
     assert RunFolder(complete).load_failure() is None
@@ -73,7 +63,7 @@ def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a sweep over three seeds, one after another."""
     folder = tmp_path_factory.mktemp("basic") / "sweep"
     arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={folder}"]
-    done = run("train", *arguments, cwd=folder.parent)
+    done = run_command(folder.parent, "cnfp-train", *arguments)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -92,7 +82,7 @@ def test_launchers_give_the_runs_that_one_after_another_gives(
     launcher: str, basic: Path, tmp_path: Path
 ) -> None:
     arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={tmp_path / 's'}"]
-    done = run("train", *arguments, f"hydra/launcher={launcher}", cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", *arguments, f"hydra/launcher={launcher}")
     assert done.returncode == 0, done.stderr
     assert results(tmp_path / "s") == results(basic)
     assert [row["state"] for row in table(basic)] == ["done"] * 3
@@ -154,7 +144,7 @@ def test_a_signal_stops_runs_side_by_side_when_they_are_saved(number: int, tmp_p
 def test_a_study_finds_no_run_that_broke_a_constraint(tmp_path: Path) -> None:
     study = ["hydra/sweeper=study", "hydra.sweeper.n_trials=6", f"hydra.sweep.dir={tmp_path / 's'}"]
     varied = ["flow=exact,unconstrained", "optim.lr=tag(log,interval(1e-4,1e-2))"]
-    done = run("train", "-m", *TINY, *study, *varied, cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", "-m", *TINY, *study, *varied)
     assert done.returncode == 0, done.stderr
     rows = table(tmp_path / "s")
     assert {row["flow"] for row in rows} == {"exact", "unconstrained"}
@@ -188,8 +178,8 @@ def test_a_job_that_slurm_starts_again_goes_on(
     shutil.copytree(basic / table(basic)[0]["folder"], tmp_path / "run")
     (tmp_path / "run" / SUMMARY).unlink()
     arguments = [*TINY, "seed=0", f"hydra.run.dir={tmp_path / 'run'}"]
-    assert "holds ['config.yaml'" in run("train", *arguments, cwd=tmp_path).stderr
+    assert "holds ['config.yaml'" in run_command(tmp_path, "cnfp-train", *arguments).stderr
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    again = run("train", *arguments, cwd=tmp_path)
+    again = run_command(tmp_path, "cnfp-train", *arguments)
     assert again.returncode == 0, again.stderr
     assert "goes on at step 96" in again.stderr

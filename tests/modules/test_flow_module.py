@@ -38,7 +38,7 @@ from cnfp_torchrl.modules import (
     make_constrained_actor,
     with_reference_entropy,
 )
-from tests.modules.point_nav import inside, make_actor
+from tests.point_nav import inside, make_actor
 
 FLOWS = ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
 NAMES = [*FLOWS[:5], "squash", "projection", "unconstrained"]

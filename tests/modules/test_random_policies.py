@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.modules import SafeRandomPolicy, WarmUpPolicy, flow_head
-from tests.modules.point_nav import inside, make_actor, make_tanh_actor
+from tests.point_nav import inside, make_actor, make_tanh_actor
 
 AGENTS = 8
 
