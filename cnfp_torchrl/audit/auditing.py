@@ -34,7 +34,13 @@ from cnfp_torchrl.audit.rollouts import roll_out
 from cnfp_torchrl.audit.samples import draw_samples
 from cnfp_torchrl.audit.states import bare, state_keys, uniform_states
 from cnfp_torchrl.configuration import require_fields
-from cnfp_torchrl.envs import Indicator, StateSetter, constraint_bijectors, find_task_view
+from cnfp_torchrl.envs import (
+    Indicator,
+    StateSetter,
+    constraint_bijectors,
+    find_task_view,
+    refuse_misnamed_judges,
+)
 from cnfp_torchrl.modules import ConstrainedFlowModule, ConstraintBijector, Flow, flow_head
 
 
@@ -115,12 +121,14 @@ def audit(
         settings: extent of the audit.
 
     Raises:
-        ValueError: when the environment publishes no geometry, or no indicator judges any of it.
+        ValueError: when the environment publishes no geometry, or no indicator judges any of it,
+            and for one of nearly a constraint's name.
         TypeError: when the environment has no state setter and cannot be copied with its state.
     """
     settings = AuditSettings() if settings is None else settings
     head = _head(env, bijectors, order, flow) if actor is None else flow_head(actor)
     reader = StepReader(env, head, indicators)
+    refuse_misnamed_judges(head.order, reader.names)
     if not set(reader.names) & set(head.order):
         raise ValueError(
             f"indicators: expected one for at least one of the constraints {head.order}, given "

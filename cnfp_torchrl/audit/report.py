@@ -169,6 +169,14 @@ class AuditReport:
         for name in self.order:
             found = [x for measured in self.sources.values() for x in measured if x.name == name]
             if any(metrics.had.count for metrics in found):
+                # A set without interior, whose actions only the executed steps judge.
+                broken = self.executed.violations_while.get(name, {}).get("relaxed", 0)
+                if broken and not any(x.gave_way.count < x.gave_way.of for x in found):
+                    yield (
+                        f"{name}: too narrow a set in all states, so that it is widened a little, "
+                        f"and {broken} of {self.executed.steps} executed steps violate the "
+                        "indicator; widen the set, or give the indicator a tolerance"
+                    )
                 continue
             relaxed = sum(metrics.relaxed.count for metrics in found)
             dropped = sum(metrics.dropped.count for metrics in found)
@@ -296,7 +304,8 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         yield "\n".join(f"note: {note}" for note in report.notes)
     yield from _examples(report)
     flaws = report.flaws
-    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else "no flaw found"
+    audited = f"; {', '.join(unjudged)}: not judged" if unjudged else ""
+    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else f"no flaw found{audited}"
 
 
 def _examples(report: AuditReport) -> Iterator[str]:

@@ -10,6 +10,7 @@ from cnfp_torchrl.envs.cost import (
     Indicator,
     constraint_names,
     counted_constraints,
+    refuse_misnamed_judges,
 )
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.packed_states import PackedStates
@@ -76,4 +77,5 @@ __all__ = [
     "counted_constraints",
     "environment_layers",
     "find_task_view",
+    "refuse_misnamed_judges",
 ]

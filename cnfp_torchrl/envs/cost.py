@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from cnfp_torchrl.keys import COST_KEY, EPISODE_COST_KEY
 from cnfp_torchrl.modules import appended_transforms
@@ -111,6 +113,7 @@ class ConstraintCost(Transform):
             next_tensordict: What the actions led to.
 
         Raises:
+            TypeError: for an indicator that returns no tensor.
             ValueError: for an indicator of the wrong shape or dtype.
         """
         assert self.indicators is not None
@@ -118,6 +121,11 @@ class ConstraintCost(Transform):
         for name, indicator in self.indicators.items():
             column = indicator(tensordict, next_tensordict)
             batch = next_tensordict.batch_size
+            if not isinstance(column, Tensor):
+                raise TypeError(
+                    f"indicator '{name}': expected it to return a bool tensor of shape "
+                    f"{tuple(batch)}, given {type(column).__name__}"
+                )
             if column.dtype != torch.bool or column.shape != batch:
                 raise ValueError(
                     f"indicator '{name}': expected bool of shape {tuple(batch)}, "
@@ -156,7 +164,8 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
     """Return the names of the columns of an environment's ``cost``.
 
     They are, in this order of preference: those of the last `ConstraintCost` with indicators, the
-    environment's ``constraint_names``, and those in the metadata of a wrapped Gymnasium env.
+    environment's ``constraint_names``, and those in the metadata of a wrapped Gymnasium env. Of
+    environments in a row, those of another one made like the first.
 
     Raises:
         ValueError: when the environment names none.
@@ -164,6 +173,17 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
     for transform in reversed(appended_transforms(env)):
         if isinstance(transform, ConstraintCost) and transform.indicators is not None:
             return transform.constraint_names
+    bare = env
+    while isinstance(bare, TransformedEnv):
+        bare = bare.base_env
+    if isinstance(bare, BatchedEnvBase):
+        # Not the workers: they end when they are asked for what they have not, and one that is not
+        # started asks itself without end.
+        one: EnvBase = bare.create_env_fn[0](**bare.create_env_kwargs[0])
+        try:
+            return constraint_names(one)
+        finally:
+            one.close(raise_if_closed=False)
     names = getattr(env, "constraint_names", None) or (getattr(env, "metadata", None) or {}).get(
         "constraint_names"
     )
@@ -172,7 +192,34 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
             f"env: expected one that names its constraints (constraint_names, or a ConstraintCost "
             f"with indicators), given {type(env).__name__}"
         )
-    return tuple(names)
+    if isinstance(names[0], str):
+        return tuple(names)
+    # SerialEnv and ParallelEnv give those of each of their environments.
+    first, *others = map(tuple, names)
+    if any(other != first for other in others):
+        raise ValueError(
+            f"env: expected environments with the same constraint_names, given {list(names)}"
+        )
+    return first
+
+
+def refuse_misnamed_judges(constraints: Sequence[str], judged: Sequence[str]) -> None:
+    """Refuse a constraint without a judge of its name where there is one of nearly its name.
+
+    Args:
+        constraints: The names of the constraints that have geometry.
+        judged: The names of the judges.
+
+    Raises:
+        ValueError: naming both.
+    """
+    others = [name for name in judged if name not in constraints]
+    for name in constraints:
+        if name not in judged and (alike := get_close_matches(name, others, n=1)):
+            raise ValueError(
+                f"constraint {name!r}: expected a judge of the same name in the environment, "
+                f"given one named {alike[0]!r}; give geometry and judge one name"
+            )
 
 
 def counted_constraints(env: EnvBase) -> tuple[str, ...]:

@@ -170,7 +170,7 @@ class TaskView:
     """Numbers to draw over time; then `series_values` is needed."""
 
     position_keys: Sequence[NestedKey] = ()
-    """The entries of a state that `position` reads."""
+    """The entries of a state that `position` reads; with them, unlogged steps take less time."""
 
     state_setter: StateSetter | None = None
     """The function that puts the environment into chosen states; None where none can."""

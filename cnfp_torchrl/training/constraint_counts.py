@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from difflib import get_close_matches
 from typing import Any, Self
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import counted_constraints
+from cnfp_torchrl.envs import counted_constraints, refuse_misnamed_judges
 from cnfp_torchrl.keys import (
     CONSTRAINT_STATES,
     CONSTRAINTS_KEY,
@@ -112,14 +111,8 @@ class ConstraintTally:
         geometry = env.observation_spec.get(CONSTRAINTS_KEY, None)
         entries = geometry.items() if isinstance(geometry, Composite) else ()
         specs = {name: spec for name, spec in entries if name not in RESERVED_NAMES}
-        others = [name for name in judged if name not in specs]
+        refuse_misnamed_judges(tuple(specs), judged)
         missed = [name for name in specs if name not in judged]
-        for name in missed:
-            if alike := get_close_matches(name, others, n=1):
-                raise ValueError(
-                    f"constraint {name!r}: expected a judge of the same name in the environment, "
-                    f"given one named {alike[0]!r}; give geometry and judge one name"
-                )
         if missed:
             given = f"cost has columns for {list(judged)}" if judged else "it has no cost"
             warnings.warn(

@@ -17,15 +17,16 @@ STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 @contextmanager
 def starting_workers() -> Iterator[None]:
-    """Let processes that are started here live through Ctrl-C, which ends the run after its step.
+    """Let processes that are started here live through the signals that stop a run after its step.
 
-    A terminal sends it to all its processes, and workers that ended by it would take the step with
-    them. They end with the run. SIGTERM they obey, for by it TorchRL ends those that are left when
-    one has died. A Ctrl-C that comes meanwhile reaches this process at the end.
+    A terminal sends Ctrl-C to all its processes, and Slurm SIGTERM to all of a job: workers that
+    ended by it would take the step with them. They end with the run; one that does not answer is
+    killed, as TorchRL does in the end. A signal that comes meanwhile reaches this process when
+    they are started.
     """
-    # Otherwise started with the first worker, after which it lets the signal through.
+    # Otherwise started with the first worker, after which it lets the signals through.
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
     finally:

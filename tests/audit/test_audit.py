@@ -236,6 +236,24 @@ def test_a_point_is_no_flaw_though_it_is_always_relaxed() -> None:
     assert report.flaws == []
 
 
+def test_too_narrow_a_set_whose_actions_violate_is_a_flaw() -> None:
+    """Never active, it is judged by what was executed: such as a budget in another unit."""
+
+    class Aside(GeometryTransform):
+        def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+            limit = tensordict["observation"][..., 0]
+            center = torch.tensor([0.99, 0.99]).expand(*limit.shape, 2)
+            return Ball(center, torch.zeros_like(limit), validate_args=False)
+
+    env = with_geometry(Disc(64), Aside("disc"))
+    settings = AuditSettings(states=32, actions=8, steps=2)
+    report = audit(env, state_setter=set_state, settings=settings)
+    assert of(report, "uniform").had.share == 1
+    (flaw,) = report.flaws
+    assert flaw.startswith("disc: too narrow a set in all states")
+    assert "128 of 128 executed steps" in flaw
+
+
 def test_a_flow_that_leaves_the_wider_set_is_a_flaw() -> None:
     env = with_geometry(Disc(64), Impossible(1.0))
     settings = AuditSettings(states=32, actions=8, steps=2)
@@ -339,6 +357,8 @@ def test_own_indicators_judge() -> None:
     assert any("other" in note for note in report.notes)
     with pytest.raises(ValueError, match="expected one for at least one of the constraints"):
         audit(env, state_setter=set_state, indicators={"other": over}, settings=settings)
+    with pytest.raises(ValueError, match=r"'disc': expected a judge of the same name.*'disk'"):
+        audit(env, state_setter=set_state, indicators={"disk": over}, settings=settings)
 
 
 def test_a_constraint_without_indicator_is_not_judged() -> None:
@@ -352,7 +372,7 @@ def test_a_constraint_without_indicator_is_not_judged() -> None:
     assert found.unsound is found.coverage is found.possible is None
     assert found.volume["median"] is not None
     assert any(note.startswith("second: no indicator") for note in report.notes)
-    assert "not judged" in str(report)
+    assert str(report).endswith("no flaw found; second: not judged")
     assert audit_figure(report)
 
 

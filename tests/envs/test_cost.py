@@ -1,12 +1,22 @@
 """The cost transform: the environment's costs, one's own indicators, sums, names, bad input."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, GymEnv, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    EnvBase,
+    GymEnv,
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    check_env_specs,
+)
 
-from cnfp_torchrl.envs import ConstraintCost, constraint_names
+from cnfp_torchrl.envs import ConstraintCost, constraint_names, counted_constraints
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 
 
@@ -38,14 +48,54 @@ def test_costs_and_their_sum(batch_size: tuple[int, ...], indicators: dict | Non
         assert torch.equal(episode["next", "episode_cost"], total)
 
 
+class Renamed(PointNavEnv):
+    constraint_names = ("wall", "battery")
+
+
 def test_names_through_a_stack() -> None:
     env = TransformedEnv(PointNavEnv(), ConstraintCost())
     assert env.transform.constraint_names == ("obstacle", "battery")
     assert constraint_names(PointNavEnv()) == ("obstacle", "battery")
+    several = SerialEnv(2, PointNavEnv)
+    several.reset()
+    assert constraint_names(TransformedEnv(several, ConstraintCost())) == ("obstacle", "battery")
+    several.close()
+    others = SerialEnv(2, [PointNavEnv, Renamed])
+    others.reset()
+    with pytest.raises(ValueError, match="expected environments with the same constraint_names"):
+        constraint_names(others)
+    others.close()
     with pytest.raises(ValueError, match="expected one that names its constraints"):
         constraint_names(GymEnv("Pendulum-v1"))
     with pytest.raises(RuntimeError, match="expected indicators or an environment"):
         _ = ConstraintCost().constraint_names
+
+
+def judged_in_a_worker() -> TransformedEnv:
+    return TransformedEnv(GymEnv("Pendulum-v1"), ConstraintCost({"fast": fast}))
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize(
+    ("one", "names"),
+    [(PointNavEnv, ("obstacle", "battery")), (judged_in_a_worker, ("fast",)), ("Pendulum-v1", ())],
+)
+def test_names_of_environments_in_a_row(batched: type, one: object, names: tuple[str, ...]) -> None:
+    """Asked themselves, those not started recurse, and workers without an answer end."""
+    make = partial(GymEnv, one) if isinstance(one, str) else one
+    env = TransformedEnv(batched(2, make), RewardSum())
+    assert counted_constraints(env) == names
+    if not names:
+        with pytest.raises(ValueError, match="expected one that names its constraints"):
+            constraint_names(env)
+    env.close(raise_if_closed=False)
+
+
+def test_names_of_environments_in_a_row_that_have_begun() -> None:
+    env = SerialEnv(2, PointNavEnv)
+    env.reset()
+    assert constraint_names(env) == ("obstacle", "battery")
+    env.close()
 
 
 def wide(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
@@ -54,6 +104,16 @@ def wide(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
 
 def number(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
     return torch.zeros(4)
+
+
+def nothing(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> None:
+    return None
+
+
+def test_an_indicator_returns_a_tensor() -> None:
+    env = TransformedEnv(PointNavEnv((4,)), ConstraintCost({"odd": nothing}))  # type: ignore[dict-item]
+    with pytest.raises(TypeError, match=r"'odd': expected it to return a bool tensor.*NoneType"):
+        env.rollout(1)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_a_refusal_is_not_hidden_by_processes_that_never_began() -> None:
 @pytest.mark.parametrize(
     ("overrides", "functions"),
     [
-        (["compile=true"], ["CompiledGeometry._computed"]),
+        (["compile=true"], ["StepGeometry._all_published"]),
         (["compile=false"], []),
         # Without an anchor, and without constraints, nothing calls it.
         (["compile=true", "flow=squash"], []),

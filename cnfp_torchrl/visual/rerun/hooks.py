@@ -97,7 +97,8 @@ def _entries_for(stream: FlowStream, batch: TensorDictBase) -> TensorDictBase:
 
     To index every entry of a batch takes several times as long as to count a step.
     """
-    return batch if stream.is_due else batch.select(*stream.counted_keys, strict=False)
+    keys = None if stream.is_due else stream.counted_keys
+    return batch if keys is None else batch.select(*keys, strict=False)
 
 
 def _agent_index(agent: int, shape: Sequence[int]) -> tuple[int, ...]:

@@ -128,9 +128,11 @@ class FlowStream:
         return self._calls % self._every == 0
 
     @property
-    def counted_keys(self) -> list[NestedKey]:
-        """What is read of a step that is only counted, where it is there."""
+    def counted_keys(self) -> list[NestedKey] | None:
+        """What is read of a step that is only counted, where it is there; None: maybe anything."""
         position = [] if self._map is None else self.setting.view.position_keys
+        if self._map is not None and not position:
+            return None
         return [*self._checked, ("next", "done"), *position]
 
     @torch.no_grad()

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
+from torchrl.envs import CatTensors, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl import constrain_env
+from cnfp_torchrl.envs import Map, ShowTask, TaskView
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, StreamTransform
@@ -87,6 +89,30 @@ def test_a_hook_that_leaves_out_steps_records_what_the_stream_does(
     assert list(read(one, EXECUTED, "Points2D:positions")) == [0, 5 * agents, 10 * agents]
     same = compare(one, other)
     assert same.returncode == 0, same.stderr
+
+
+class OnAMap(TaskView):
+    """A view that does not say which entries its position is read from."""
+
+    map = Map((0.0, 4.0), (0.0, 4.0))
+
+    def position(self, states: TensorDictBase) -> Tensor:
+        return states["nested", "place"]
+
+
+def test_steps_that_are_left_out_have_what_a_view_may_read(tmp_path: Path) -> None:
+    env, actor = pipeline([])
+    place = CatTensors(["observation"], ("nested", "place"), del_keys=False)
+    env = env.append_transform(place).append_transform(ShowTask(OnAMap()))
+    # The first two numbers are the place; what is observed stays as it was.
+    rollout = env.rollout(6, actor, break_when_any_done=False)
+    rollout["nested", "place"] = rollout["nested", "place"][..., :2]
+
+    def by_hook(stream: rr.RecordingStream) -> None:
+        StreamHook(FlowStream(stream, actor, env, every=3))(rollout)
+
+    path = record(tmp_path / "recording.rrd", by_hook)
+    assert list(read(path, EXECUTED, "Points2D:positions")) == [0, 3]
 
 
 @pytest.mark.parametrize(("batch", "agent"), [([3], 2), ([], 0)])
