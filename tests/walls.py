@@ -107,10 +107,10 @@ class Told(GeometryTransform):
         self, publish: Callable[[TensorDictBase], Any], name: str = "told", **options: Any
     ) -> None:
         super().__init__(name, **options)
-        self.publish = publish
+        self.answer = publish
 
     def constraint_set(self, tensordict: TensorDictBase) -> Any:
-        return self.publish(tensordict)
+        return self.answer(tensordict)
 
 
 def walls(base: EnvBase, *geometries: GeometryTransform) -> TransformedEnv:
