@@ -31,11 +31,11 @@ from cnfp_torchrl.deploy.self_test import latencies
 from cnfp_torchrl.envs import GeometryTransform
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.installed_versions import installed_versions
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.training.networks import gaussian_network
 from cnfp_torchrl.whole_file import whole_file, write_json
 from cnfp_torchrl.wrappers.observed_env import ObservedEnv
-from experiments.resume import markdown
-from tests.geometry.cases import FAMILIES
+from experiments.random_sets import FAMILIES
 
 RESULT = Path(__file__).parent / "results" / "exported.md"
 ROWS = RESULT.with_suffix(".json")
@@ -153,7 +153,7 @@ def main() -> None:
         "onnxruntime. Violations are certified actions outside of their set or the action bounds, "
         "with zero tolerance. Times are medians of 100 calls with one state, eager mode and "
         "onnxruntime by turns, on one thread of the processor, in its own time.\n\n"
-        f"{markdown([HEADER, *(rows[name] for name in DIMENSIONS if name in rows)])}\n"
+        f"{markdown_table([HEADER, *(rows[name] for name in DIMENSIONS if name in rows)])}\n"
     )
     with whole_file(RESULT) as file:
         file.write(text.encode())

@@ -34,6 +34,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import constraint_bijectors, constraint_names
 from cnfp_torchrl.modules import flow_head, make_constrained_actor
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.training.agent import build_actor, build_environment
 
 RESULT = Path(__file__).parent / "results" / "hostile_networks.json"
@@ -217,19 +218,18 @@ def as_markdown(result: dict[str, Any]) -> str:
     columns = ["flow", "network: latent mean and scale", "steps"]
     columns += [f"violations: {name}" for name in names]
     columns += ["constraints dropped", "least slack of the anchor"]
-    lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
+    rows = [columns]
     for row in result["rows"]:
         counts = [f"{row['violations'][name]:,}" for name in names]
         dropped = f"{sum(row['drops'].values()):,}"
         cells = [row["flow"], row["network"], f"{row['steps']:,}", *counts, dropped]
-        lines.append(" | ".join([*cells, f"{row['minimum_anchor_slack']:.5f}"]))
-    table = "\n".join(f"| {line} |" for line in lines)
+        rows.append([*cells, f"{row['minimum_anchor_slack']:.5f}"])
     versions = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
     return (
         f"# Violations of hostile networks\n\n`{result['command']}`\n\n{versions}\n\n"
         "Means are those of the latent Gaussian; +- stands for a sign drawn for each component. "
         "Slack is in action units.\n\n"
-        f"{table}\n"
+        f"{markdown_table(rows)}\n"
     )
 
 

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +33,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cnfp_torchrl.configuration import compose_config
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
 from cnfp_torchrl.training.run_state import RunState
 from cnfp_torchrl.training.train import train
@@ -187,12 +188,6 @@ def cost(root: Path, steps: int) -> list[list[str]]:
     ]
 
 
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows, the header first, as a table in Markdown."""
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def main() -> None:
     """Do it all, and write `RESULT`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -218,9 +213,9 @@ def main() -> None:
         f"{options.kills} kills by SIGKILL at moments drawn over the processor time of a run, its "
         f"start and evaluation included. A run takes {options.steps} steps and saves every 400. "
         "Compared are weights, optimizer, summary, CSV and TensorBoard, but for times.\n\n"
-        f"{markdown(rows)}\n\n"
+        f"{markdown_table(rows)}\n\n"
         f"## What states cost\n\nThe default configuration for {options.cost_steps} steps, a state "
-        f"every 10,000.\n\n{markdown(costs)}\n"
+        f"every 10,000.\n\n{markdown_table(costs)}\n"
     )
     with whole_file(RESULT) as file:
         file.write(text.encode())

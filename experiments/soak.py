@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.keys import CONSTRAINT_STATES
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.constraint_counts import ConstraintTally
 from cnfp_torchrl.training.storage import prepare_buffer
@@ -88,22 +89,19 @@ def main() -> None:
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "tensordict"))
     given = " ".join(f"--{name} {value}" for name, value in vars(options).items())
     wall, processor = time.perf_counter() - started[0], time.process_time() - started[1]
-    states = "\n".join(
-        f"| {name} | {count.violations} | "
-        + " | ".join(f"{count.steps.get(state, 0):,}" for state in CONSTRAINT_STATES)
-        + " |"
-        for name, count in counts.items()
-    )
-    table = "\n".join(f"| {n:,} | {rss:.1f} | {seconds:.0f} |" for n, rss, seconds in rows)
+    states = [["constraint", "violations", *(f"steps: {name}" for name in CONSTRAINT_STATES)]]
+    for name, count in counts.items():
+        steps_in = [f"{count.steps.get(state, 0):,}" for state in CONSTRAINT_STATES]
+        states.append([name, str(count.violations), *steps_in])
+    memory = [["steps", "resident memory, MiB", "processor, s"]]
+    memory += [[f"{n:,}", f"{rss:.1f}", f"{seconds:.0f}"] for n, rss, seconds in rows]
     text = (
         f"# {steps:,} steps\n\n`python experiments/soak.py {given}`\n\n"
         f"python {platform.python_version()}, {packages}\n\n"
         f"{steps:,} steps through the collector in {wall:.0f} s ({processor:.0f} s of one "
         f"processor, {steps / processor:,.0f} steps a second). Violations: {violations}. Memory: "
         f"{growth:+.2%} from the highest of the first half to the end.\n\n"
-        f"| constraint | violations | steps: {' | steps: '.join(CONSTRAINT_STATES)} |\n"
-        f"| --- | --- | --- | --- | --- |\n{states}\n\n"
-        f"| steps | resident memory, MiB | processor, s |\n| --- | --- | --- |\n{table}\n"
+        f"{markdown_table(states)}\n\n{markdown_table(memory)}\n"
     )
     with whole_file(RESULT) as file:
         file.write(text.encode())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Self
 from unittest.mock import patch
 
@@ -21,6 +22,16 @@ _WAITS = (
     "aten::nonzero",
 )
 """Operations whose result the host waits for, or that copy numbers of Python's to the device."""
+
+
+@contextmanager
+def no_synchronization() -> Iterator[None]:
+    """Let whatever waits for a GPU raise an error in this context."""
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 class HostReads(TorchDispatchMode):

@@ -1,15 +1,12 @@
 """The commands, each in a process of its own."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
-from tests.entry_points import ROOT, SCRIPTS
+from tests.entry_points import run_command
 
 TINY = [
     "collector.total_frames=96",
@@ -22,24 +19,12 @@ TINY = [
 ]
 
 
-def run(cwd: Path, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", SCRIPTS[command].partition(":")[0], *arguments],
-        cwd=cwd,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train twice in one place."""
     place = tmp_path_factory.mktemp("runs")
     for _ in range(2):
-        done = run(place, "cnfp-train", *TINY)
+        done = run_command(place, "cnfp-train", *TINY)
         assert done.returncode == 0, done.stderr
         assert "violations: obstacle 0, battery 0" in done.stdout
     return place
@@ -62,7 +47,7 @@ def test_everything_of_a_run_is_in_its_folder(folder: Path) -> None:
 
 def test_evaluate_prints_a_table_and_writes_it(folder: Path, tmp_path: Path) -> None:
     (place, _) = folder.glob("outputs/*/*/")
-    done = run(tmp_path, "cnfp-evaluate", f"run={place}", "evaluation.episodes=3")
+    done = run_command(tmp_path, "cnfp-evaluate", f"run={place}", "evaluation.episodes=3")
     assert done.returncode == 0, done.stderr
     for name in ("trained, stochastic", "trained, deterministic", "safe random", "shortest path"):
         assert name in done.stdout
@@ -73,7 +58,7 @@ def test_evaluate_prints_a_table_and_writes_it(folder: Path, tmp_path: Path) -> 
 
 
 def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
-    done = run(tmp_path, "cnfp-train", "-m", "seed=0,1", "flow=exact,squash", *TINY)
+    done = run_command(tmp_path, "cnfp-train", "-m", "seed=0,1", "flow=exact,squash", *TINY)
     assert done.returncode == 0, done.stderr
     summaries = [
         json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")
@@ -100,7 +85,7 @@ def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
 def test_wrong_input_is_explained(
     command: str, arguments: list[str], message: str, tmp_path: Path
 ) -> None:
-    done = run(tmp_path, command, *arguments)
+    done = run_command(tmp_path, command, *arguments)
     assert done.returncode != 0
     assert message in done.stderr
     # Nothing before the cause, and no traceback behind it.
@@ -113,7 +98,7 @@ def test_a_refused_training_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("kept")
     for folder in ("new", "mine"):
-        done = run(tmp_path, "cnfp-train", *TINY, f"hydra.run.dir={folder}", "optim.lr=-1")
+        done = run_command(tmp_path, "cnfp-train", *TINY, f"hydra.run.dir={folder}", "optim.lr=-1")
         assert done.returncode == 1
         assert "optim.lr: expected a finite number > 0" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]

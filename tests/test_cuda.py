@@ -1,6 +1,5 @@
 """On a GPU: the same results as on a CPU, no violation in float32 with TF32, and no waiting."""
 
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -32,6 +31,8 @@ from cnfp_torchrl.envs import ActionGuard
 from cnfp_torchrl.objectives import ConstrainedSACLoss, FusedSoftUpdate
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.update import Update
+from experiments.benchmarks.waits import waits
+from tests.host_reads import no_synchronization
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that CUDA can use"),
@@ -105,27 +106,6 @@ def tf32() -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-@contextmanager
-def no_synchronization() -> Iterator[None]:
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        yield
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-
-
-def synchronizations(call: Callable[[], object]) -> int:
-    """Return how often a call waits for the GPU."""
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            call()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(warning.message) for warning in caught)
 
 
 @pytest.mark.parametrize("impossible", [False, True])
@@ -234,6 +214,6 @@ def test_a_step_waits_once_more_than_without_constraints() -> None:
         for _ in range(2):
             state = env.reset()
             state["action"] = torch.zeros(256, 2, device="cuda")
-            counts.append(synchronizations(lambda: env.step(state)))  # noqa: B023 - called at once
+            counts.append(waits(lambda: env.step(state)))  # noqa: B023 - called at once
     _, plain, _, constrained = counts
     assert constrained <= plain + 1

@@ -9,15 +9,15 @@ from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.envs.compiled_geometry import CompiledGeometry, anchor_entries
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform, are_good
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
-from cnfp_torchrl.geometry import LEEWAY, Begun, Box, GeometryError, begin_anchor, finish_anchor
-from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
+from cnfp_torchrl.envs.step_geometry import StepGeometry, anchor_entries
+from cnfp_torchrl.geometry import LEEWAY, Box, finish_anchor
+from cnfp_torchrl.keys import ANCHOR_KEY
 from cnfp_torchrl.modules import (
     ActionBounds,
     ConstraintBijector,
@@ -93,12 +93,10 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._watch = RelaxationWatch([bijector.name for bijector in self._bijectors], leeway)
         # Read from the parent once; a module, to move with the environment.
         self._bounds: ActionBounds | None = None
-        # Those whose checks are settled here, looked up at the first step of an episode.
-        self._geometries: list[GeometryTransform] | None = None
         self._compiles = compile
-        # In use between resets; kept for the next episode, because it takes long to compile.
-        self._compiled: CompiledGeometry | None = None
-        self._known_program: CompiledGeometry | None = None
+        # In use between resets; kept for the next episode, because it may take long to compile.
+        self._geometry: StepGeometry | None = None
+        self._known_geometry: StepGeometry | None = None
         # The last policy of a collector that was found to fit: each is examined once.
         self._fitting: Callable[[], nn.Module | None] = _no_policy
 
@@ -113,20 +111,21 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         return list(self._bijectors)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        batch = next_tensordict.batch_size
-        if self._compiled is not None:
-            begun, flags = self._compiled(next_tensordict)
-        else:
-            begun = self._begun(next_tensordict)
-            flags = begun.attempt.decided.all().unsqueeze(0)
-        if self._settled(next_tensordict, flags):
+        batch, bounds, geometry = next_tensordict.batch_size, self._action_bounds(), self._geometry
+        if geometry is None:
+            geometry = StepGeometry([], self._bijectors, bounds)
+        elif geometry.bounds is not bounds:  # moved to another device
+            geometry = self._take_over()
+        step = geometry(next_tensordict)
+        if step.is_decided:
             self._watch.all_held(batch.numel())
-            if self._compiled is not None:
-                return next_tensordict  # it has published that all sets hold
-            found = begun.all_held()
+            if step.is_published:
+                return next_tensordict
+            found = step.begun.all_held()
         else:
-            if self._compiled is not None:
-                begun = begun._replace(sets=self._compiled.sets(next_tensordict))
+            begun = step.begun
+            if step.is_published:
+                begun = begun._replace(sets=geometry.sets(next_tensordict))
             found = finish_anchor(begun, self._leeway)
             if self._watch.looks and bool(found.active.all()):
                 self._watch.all_held(batch.numel())
@@ -136,73 +135,33 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
             next_tensordict.set(key, value)
         return next_tensordict
 
-    def _begun(self, next_tensordict: TensorDictBase) -> Begun:
-        """Begin to look for anchors by the sets in a tensordict."""
-        bounds = self._action_bounds()
-        # In the dtype of the actions, as the flow will see them.
-        sets = [bijector.get_set(next_tensordict).to(bounds.dtype) for bijector in self._bijectors]
-        for bijector, constraint_set in zip(self._bijectors, sets, strict=True):
-            if constraint_set.dim != bounds.dim:
-                raise GeometryError(
-                    f"constraint '{bijector.name}': expected a set of actions with {bounds.dim} "
-                    f"components, as the action spec has, given one with {constraint_set.dim}"
-                )
-        candidate = next_tensordict.get(SAFE_ACTION_KEY, None)
-        if candidate is not None:
-            candidate = candidate.to(bounds.dtype)
-        return begin_anchor([bounds, *sets], candidate)
-
-    def _settled(self, states: TensorDictBase, flags: Tensor) -> bool:
-        """Settle the checks of all geometries, and tell whether all states are decided.
-
-        Flags are read on the host together: on a GPU each read waits.
-
-        Args:
-            states: The states.
-            flags: Whether all are decided and, where it is known, whether all values are good.
-        """
-        if self._geometries is None:
-            appended = appended_transforms(self.container)
-            before = takewhile(lambda transform: transform is not self, appended)
-            self._geometries = [t for t in before if isinstance(t, GeometryTransform)]
-        checks = [check for t in self._geometries if (check := t.pending_check())]
-        if checks:
-            flags = torch.cat([flags, are_good(checks).unsqueeze(0)])
-        all_decided, *good = flags.tolist()
-        if not all(good):
-            for check in checks:
-                check.refuse()
-            if self._compiled is not None:
-                self._compiled.refuse(states)
-        return bool(all_decided)
-
-    def _compile(self) -> None:
-        """From now on let the geometries right before this transform be published by it."""
+    def _take_over(self) -> StepGeometry:
+        """From now on publish in one pass what the geometries right before this transform do."""
         appended = appended_transforms(self.container)
         before = reversed(list(takewhile(lambda transform: transform is not self, appended)))
         geometries = list(takewhile(lambda t: isinstance(t, GeometryTransform), before))[::-1]
         for geometry in geometries:
             geometry.is_published_by_another = True
-        known, bounds = self._known_program, self._action_bounds()
+        known, bounds = self._known_geometry, self._action_bounds()
         if known is None or known.geometries != geometries or known.bounds is not bounds:
-            self._known_program = CompiledGeometry(geometries, self._bijectors, bounds)
-        self._compiled = self._known_program
+            known = StepGeometry(geometries, self._bijectors, bounds, compile=self._compiles)
+        self._geometry = self._known_geometry = known
+        return known
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._refuse_unseen_steps()
         self._refuse_misfit_of_collector()
-        self._geometries, self._compiled = None, None
+        self._geometry = None
         reset = self._call(tensordict_reset)
-        if self._compiles:
-            self._compile()
+        self._take_over()
         return reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Fill in anchor and flags of stored transitions, at root and under next."""
-        # In a replay buffer the geometries publish their sets and settle their checks themselves.
-        self._geometries, self._compiled = [], None
+        # In a replay buffer the geometries publish their sets themselves.
+        self._geometry = None
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
@@ -259,7 +218,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._fitting = weakref.ref(policy)
 
     def __getstate__(self) -> dict[str, Any]:
-        alone = {"_fitting": _no_policy, "_compiled": None, "_known_program": None}
+        alone = {"_fitting": _no_policy, "_geometry": None, "_known_geometry": None}
         return {**super().__getstate__(), **alone}
 
     def clone(self) -> Self:
@@ -267,7 +226,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         if self.parent is not None:
             self._action_bounds()
         copy = super().clone()
-        copy._geometries = copy._compiled = copy._known_program = None
+        copy._geometry = copy._known_geometry = None
         return copy
 
     def _action_bounds(self, device: torch.device | None = None) -> Box:

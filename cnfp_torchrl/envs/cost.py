@@ -192,7 +192,15 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
             f"env: expected one that names its constraints (constraint_names, or a ConstraintCost "
             f"with indicators), given {type(env).__name__}"
         )
-    return tuple(names)
+    if isinstance(names[0], str):
+        return tuple(names)
+    # SerialEnv and ParallelEnv give those of each of their environments.
+    first, *others = map(tuple, names)
+    if any(other != first for other in others):
+        raise ValueError(
+            f"env: expected environments with the same constraint_names, given {list(names)}"
+        )
+    return first
 
 
 def refuse_misnamed_judges(constraints: Sequence[str], judged: Sequence[str]) -> None:

@@ -14,7 +14,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from cnfp_torchrl.geometry import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry import (
+    ConstraintSet,
+    Evidence,
+    GeometryError,
+    are_within,
+    extremes,
+)
 from cnfp_torchrl.keys import (
     CONSTRAINTS_KEY,
     RESERVED_NAMES,
@@ -76,10 +82,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     _family: type[ConstraintSet] | None = None
     _is_compared = False
-    _is_settled_by_another = False
     is_published_by_another = False
     """Whether a transform behind this one publishes the set, until the next reset."""
-    _check: Check | None = None
     _valid_shapes: list[tuple[torch.Size, torch.dtype]] | None = None
 
     def __init__(
@@ -253,7 +257,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Publish at the root and, where it exists, under ``next``: for use in a replay buffer."""
-        self._is_settled_by_another = self.is_published_by_another = False
+        self.is_published_by_another = False
         self._call(tensordict)
         if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
             self._call(tensordict.get("next"))
@@ -262,45 +266,53 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.is_published_by_another:
             return next_tensordict
-        try:
-            allowed = self.checked_set(next_tensordict)
-        except Exception:
-            self._refuse_what_is_not_finite(next_tensordict)  # the likely cause
-            raise
+        allowed, _ = self.publish(next_tensordict)
         if self.validate:
-            self._check_values(next_tensordict, allowed)
-        entries = self.published(next_tensordict, allowed)
+            check = self.check(next_tensordict, allowed)
+            found = evidence([check])
+            values = torch.stack([each.value for each in found]).tolist() if found else []
+            if not are_within(values, (each.limit for each in found)):
+                check.refuse()
         if not self._is_compared and next_tensordict.numel() > 1:
             self._refuse_what_follows_the_batch(next_tensordict, allowed)
             self._is_compared = True
-        for key, value in entries.items():
-            next_tensordict.set(key, value)
         return next_tensordict
 
-    def pending_check(self) -> Check | None:
-        """Return the check of the last states for the caller to settle, as from now on each time.
+    def publish(
+        self, states: TensorDictBase
+    ) -> tuple[ConstraintSet, dict[tuple[str, ...], Tensor]]:
+        """Write the set of some states, and a safe action if there is one, into them.
 
-        For a transform behind this one that settles the checks of several at once.
+        Values are left for the caller to check (`check`).
+
+        Args:
+            states: States of any batch size.
+
+        Returns:
+            The set with its fields as they are published, and all that was written.
         """
-        check, self._check = self._check, None
-        if not self._is_settled_by_another:
-            self._is_settled_by_another = True
-        return check
+        try:
+            allowed = self.checked_set(states)
+        except Exception:
+            self._refuse_what_is_not_finite(states)  # the likely cause
+            raise
+        if self.validate and not torch.compiler.is_compiling():
+            self._check_shapes(allowed)
+        entries = self.published(states, allowed)
+        for key, value in entries.items():
+            states.set(key, value)
+        fields = allowed.fields()
+        as_published = {field: entries[field_key(self.name, field)] for field in fields}
+        if any(as_published[field] is not value for field, value in fields.items()):
+            # Not strided ones, over which all that follows takes longer.
+            allowed = type(allowed)(**as_published, validate_args=False)
+        return allowed, entries
 
-    def _check_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
+    def _check_shapes(self, allowed: ConstraintSet) -> None:
         shapes = [(value.shape, value.dtype) for value in allowed.fields().values()]
         if shapes != self._valid_shapes:
             allowed.validate_shapes(self._where(allowed))
             self._valid_shapes = shapes
-        check = self.check(states, allowed)
-        if self._is_settled_by_another and self._check is None:
-            self._check = check
-            return
-        # Nobody has settled the last one: whoever did is not behind this transform any more.
-        left, self._check, self._is_settled_by_another = self._check, None, False
-        for pending in (left, check):
-            if pending is not None and not bool(are_good([pending])):
-                pending.refuse()
 
     def check(self, states: TensorDictBase, allowed: ConstraintSet) -> Check:
         """Return what is to be checked of some states and their `checked_set`."""
@@ -312,13 +324,12 @@ class GeometryTransform(Transform, ConstraintPublisher):
         self._validated(allowed)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions stay behind.
+        # Whoever publishes it between resets stays behind.
         return {**super().__getstate__(), "is_published_by_another": False}
 
     def clone(self) -> Self:
-        """Return a copy without environment, which settles its checks itself."""
+        """Return a copy without environment, which publishes its set itself."""
         copy = super().clone()
-        copy._check, copy._is_settled_by_another = None, False
         copy.is_published_by_another = False
         return copy
 
@@ -468,21 +479,21 @@ class Check(NamedTuple):
     """Raises if a value is not as it must be."""
 
 
-def are_good(checks: Sequence[Check]) -> Tensor:
-    """Tell whether all values are as they must be, boolean ``()``, without reading it.
+def evidence(checks: Sequence[Check]) -> list[Evidence]:
+    """Return numbers that are all within their limits if all values are as they must be.
 
     Args:
-        checks: One or more checks of the same states.
+        checks: Checks of the same states.
     """
     # What several constraints read is looked at once.
     inputs = {key: value for check in checks for key, value in check.inputs.items()}
-    sizes = [
-        value.abs().amax()
+    found = [
+        each
         for value in inputs.values()
-        if value.is_floating_point() and value.numel()
+        if value.is_floating_point()
+        for each in extremes(value, torch.finfo(value.dtype).max)
     ]
-    good = [size < torch.inf for size in sizes]
-    return torch.stack([*good, *(check.allowed.is_valid() for check in checks)]).all()
+    return found + [each for check in checks for each in check.allowed.evidence()]
 
 
 def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import InitVar, dataclass
 from functools import partial
 from typing import ClassVar, NamedTuple, Self, TypeAlias
@@ -51,6 +51,28 @@ class Bounds(NamedTuple):
 
     low: Tensor
     high: Tensor
+
+
+class Evidence(NamedTuple):
+    """A number of a batch of states that tells on which side of a limit all of them are.
+
+    Args:
+        value: number or flag, ``()``.
+        limit: largest absolute value that is good; NaN never is.
+    """
+
+    value: Tensor
+    limit: float
+
+
+def extremes(values: Tensor, limit: float) -> list[Evidence]:
+    """Return the least and the largest of some values, NaN if one is; nothing if there are none."""
+    return [Evidence(value, limit) for value in values.aminmax()] if values.numel() else []
+
+
+def are_within(values: Iterable[float], limits: Iterable[float]) -> bool:
+    """Tell whether the values of evidence, read on the host, are within its limits."""
+    return all(abs(value) <= limit for value, limit in zip(values, limits, strict=True))
 
 
 class GeometryError(ValueError):
@@ -333,18 +355,19 @@ class ConstraintSet(ABC):
             self._refuse(where, field, bad, expected)
         return self
 
-    def is_valid(self) -> Tensor:
-        """Tell whether `validate` accepts the values, boolean ``()``, without reading them."""
-        sizes = []
+    def evidence(self) -> list[Evidence]:
+        """Return numbers that are all within their limits if `validate` accepts the values.
+
+        Reads nothing on the host: whoever does can read those of several sets together
+        (`are_within`).
+        """
+        most = largest_value(self.dtype)
+        found = []
         for field, value in self.fields().items():
-            size = value.abs()
             if field not in self.finite_fields:
-                size = size.nan_to_num(nan=torch.inf, posinf=0)
-            # Of no states, and NaN where a number is.
-            sizes.append(size.amax() if size.numel() else size.new_zeros(()))
-        good = torch.stack(sizes) <= largest_value(self.dtype)
-        bad = [mask.any() for _, mask, _ in self.invalid_fields()]
-        return torch.cat([good, ~torch.stack(bad)]).all() if bad else good.all()
+                value = value.nan_to_num(nan=torch.inf, posinf=0, neginf=0)
+            found += extremes(value, most)
+        return found + [Evidence(mask.any(), 0) for _, mask, _ in self.invalid_fields()]
 
     def validate_shapes(self, where: str) -> None:
         """Refuse fields of wrong types or shapes, without reading their values.

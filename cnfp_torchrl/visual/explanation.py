@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.envs import NOTHING, Component, TaskView
-from cnfp_torchrl.text_table import text_table
+from cnfp_torchrl.text_table import markdown_table, text_table
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 Effect = Literal["permissive", "restrictive", "relaxed", "dropped", "broken"]
@@ -98,7 +98,7 @@ class Explanation:
 
     def markdown(self) -> str:
         """Return it as Markdown with tables, for a viewer's panel."""
-        tables = [_markdown_table(rows) for rows in (self._effects(), self._stages()) if rows]
+        tables = [markdown_table(rows) for rows in (self._effects(), self._stages()) if rows]
         parts = [f"**{self._headline()}**", self.situation, *tables, *self._sentences()]
         return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -347,8 +347,3 @@ def _percent(share: float | None) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def _markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))

@@ -21,7 +21,6 @@ import argparse
 import platform
 import sys
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -50,6 +49,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
+from waits import waits
 
 from cnfp_torchrl import (
     Ball,
@@ -352,18 +352,6 @@ def count_violations(sizes: Sizes, device: torch.device) -> dict[str, Rows]:
         "share of relaxed states": 0.0,
     }
     return {"violations in float32, TF32 on, latents up to 1e6": rows}
-
-
-def waits(call: Call) -> int:
-    """Return how often the host waits for the GPU in a call."""
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            call()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(each.message) for each in caught)
 
 
 def count_waits(sizes: Sizes, device: torch.device) -> dict[str, Rows]:

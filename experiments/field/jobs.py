@@ -31,14 +31,15 @@ TRAINED = ("half_cheetah_power", "half_cheetah_rate", "hopper_mixed")
 """The tasks with kept records; the others take the same command."""
 
 FLOWS = {
-    "hard": "exact",
-    "soft": "soft",
-    "projection": "projection",
-    "unconstrained": "unconstrained",
+    "hard": ("flow=exact",),
+    "soft": ("flow=soft",),
+    "sharp": ("flow=soft", "+flow.sharpness=4"),
+    "projection": ("flow=projection",),
+    "unconstrained": ("flow=unconstrained",),
 }
-"""Our methods, by the flow of ``conf/flow`` that each is."""
+"""Our methods, by the overrides that choose the flow of each."""
 
-OURS = ("hard", "soft")
+OURS = ("hard", "soft", "sharp")
 """Those of them that are bijections; the others are baselines."""
 
 PEER = "sb3_projection"
@@ -93,14 +94,14 @@ class Job:
 
     def config(self, overrides: tuple[str, ...] = ()) -> DictConfig:
         """Return the training configuration; the peer's has the environment of a projection."""
-        flow = FLOWS.get(self.method, "projection")
+        flow = FLOWS.get(self.method, FLOWS["projection"])
         own = [
             f"env={self.task}",
-            f"flow={flow}",
+            *flow,
             f"seed={self.seed}",
             f"loss.target_entropy={-ACTION_SIZES[self.task]}",
         ]
-        if flow == "projection":
+        if flow == FLOWS["projection"]:
             # Of Dykstra's algorithm, for hopper_mixed alone; the other sets have closed forms.
             own.append(f"+flow.rounds={ROUNDS}")
         return compose_config(*own, *SETTINGS, *overrides)

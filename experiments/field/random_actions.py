@@ -114,7 +114,7 @@ def act(task: str, settings: Settings) -> dict[str, Any]:
         "violations": dict(zip(robots.judges, violations.long().tolist(), strict=True)),
         "relaxed": {name: count / taken for name, count in relaxed.items()},
         "drawn_and_allowed": allowed,
-        "coverage": covered / allowed,
+        "coverage": covered / allowed if allowed else None,
         "unsound": unsound,
         "seconds": round(time.perf_counter() - started, 1),
     }

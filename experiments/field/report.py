@@ -50,6 +50,7 @@ class Label(NamedTuple):
 LABELS = {
     "hard": Label("exact flow, hard retraction", "#0072B2"),
     "soft": Label("exact flow, soft retraction", "#D55E00"),
+    "sharp": Label("exact flow, soft retraction of sharpness 4", "#E69F00"),
     "projection": Label("projection in the policy", "#009E73"),
     "sb3_projection": Label("Stable-Baselines3, projection in the environment", "#CC79A7"),
     "unconstrained": Label("unconstrained", "#5A5A5A"),
@@ -195,7 +196,7 @@ def random_table(rows: list[dict[str, Any]]) -> list[str]:
             f"{row['steps']:,}",
             f"{sum(row['violations'].values())}",
             f"{max(row['relaxed'].values()):.1%}",
-            f"{row['coverage']:.2%}",
+            "-" if row["coverage"] is None else f"{row['coverage']:.2%}",
             f"{row['drawn_and_allowed']:,}",
         ]
         lines.append(f"| {' | '.join(cells)} |")

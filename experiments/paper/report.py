@@ -14,6 +14,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.paper.claims import (
     AIMS,
@@ -45,7 +46,6 @@ from experiments.paper.tables import (
     methods_table,
     provenance,
     speed_table,
-    table,
     violations_table,
 )
 
@@ -323,7 +323,7 @@ def _claims(head: Sequence[str], judged: Sequence[Judged]) -> str:
         ]
         for judgment in judged
     ]
-    return table(["", *head], rows)
+    return markdown_table([["", *head], *rows])
 
 
 def _values(numbers: Iterable[int]) -> str:

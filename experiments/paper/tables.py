@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from cnfp_torchrl.text_table import markdown_table
 from experiments.paper.figures_methods import Runs, changes_of
 from experiments.paper.labels import in_order, label
 from experiments.paper.records import HostileRun, Outcome, differences, without_seed
@@ -19,13 +20,6 @@ from experiments.paper.statistics import (
     reached,
     start_and_end,
 )
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table; bars within cells are escaped."""
-    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
-    rule = ["---"] * len(head)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (lines[0], rule, *lines[1:]))
 
 
 def methods_table(runs: Runs) -> str:
@@ -46,7 +40,7 @@ def methods_table(runs: Runs) -> str:
             ]
         )
     head = ["method", "score, stochastic", "score, deterministic", f"steps to {TARGET_SCORE:g}"]
-    return table([*head, "violating steps, worst run"], rows)
+    return markdown_table([[*head, "violating steps, worst run"], *rows])
 
 
 def speed_table(runs: Runs) -> str:
@@ -63,9 +57,17 @@ def speed_table(runs: Runs) -> str:
                 interquartile_mean([run.seconds for run in records]).text(0),
             ]
         )
-    return table(
-        ["method", "runs", "area", f"processor seconds to {TARGET_SCORE:g}", "seconds of a run"],
-        rows,
+    return markdown_table(
+        [
+            [
+                "method",
+                "runs",
+                "area",
+                f"processor seconds to {TARGET_SCORE:g}",
+                "seconds of a run",
+            ],
+            *rows,
+        ]
     )
 
 
@@ -83,7 +85,7 @@ def violations_table(runs: Runs) -> str:
     head = ["violating steps of a run"]
     for name in constraints:
         head += [f"{name}, training", f"{name}, evaluation"]
-    return table([*head, "per episode, first tenth", "per episode, last tenth"], rows)
+    return markdown_table([[*head, "per episode, first tenth", "per episode, last tenth"], *rows])
 
 
 def afterwards_table(runs: Runs) -> str:
@@ -104,7 +106,7 @@ def afterwards_table(runs: Runs) -> str:
     head = ["stochastic policy", "return, as trained", "violating steps"]
     for change in changes:
         head += [f"return, {change}", "violating steps"]
-    return table(head, rows)
+    return markdown_table([head, *rows])
 
 
 def hostile_table(flows: Mapping[str, Sequence[HostileRun]]) -> str:
@@ -124,7 +126,7 @@ def hostile_table(flows: Mapping[str, Sequence[HostileRun]]) -> str:
         ]
         for name in in_order(flows)
     ]
-    return table(["flow", "networks", "steps", *constraints], rows)
+    return markdown_table([["flow", "networks", "steps", *constraints], *rows])
 
 
 def configurations_table(runs: Runs) -> str:
@@ -141,7 +143,7 @@ def configurations_table(runs: Runs) -> str:
         for method, records in runs.items()
     ]
     head = ["method", "configuration", "seeds", "training steps"]
-    return table([*head, "what differs from the first method's configuration"], rows)
+    return markdown_table([[*head, "what differs from the first method's configuration"], *rows])
 
 
 def in_words(apart: Mapping[str, tuple[str | None, str | None]]) -> str:

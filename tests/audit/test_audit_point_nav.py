@@ -1,7 +1,6 @@
 """The audit of point navigation: the shipped geometry passes, wrong ones are caught."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,13 @@ from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
 from cnfp_torchrl.audit import AuditReport, AuditSettings, audit
-from cnfp_torchrl.commands.audit import FLAWS_FOUND, audit_configured, main
+from cnfp_torchrl.commands.audit import FLAWS_FOUND, audit_configured
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.figures.audit import audit_figure, save_audit
+from tests.entry_points import call_command
 from tests.training.conftest import TinyRun
 
 ORDER = ["battery", "obstacle"]
@@ -185,10 +185,7 @@ def test_the_command_exits_with_3_where_a_chain_of_squashes_escapes(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     low = "+env.layout.battery_start=[21,30]"
-    monkeypatch.setattr(sys, "argv", ["cnfp-audit", "flow=squash", low, *QUICK])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == FLAWS_FOUND
+    assert call_command("cnfp-audit", "flow=squash", low, *QUICK) == FLAWS_FOUND
     assert "FLAW: battery" in capsys.readouterr().out
     (folder,) = tmp_path.glob("outputs/audits/*/*/")
     assert {path.name for path in folder.iterdir()} >= {"audit.json", "audit.png"}

@@ -10,7 +10,7 @@ import pytest
 
 import cnfp_torchrl
 from cnfp_torchrl.commands.new import new_task
-from tests.entry_points import load_command
+from tests.entry_points import call_command
 
 NAME = "task_of_the_test"
 SHORTER = {
@@ -36,15 +36,6 @@ def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         del sys.modules[module]
 
 
-def run(command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", [command, *arguments])
-    try:
-        load_command(command)()
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
-
-
 def files_in(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -52,7 +43,7 @@ def files_in(folder: Path) -> dict[Path, bytes]:
 def test_what_is_said_to_do_next_works(
     parent: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("cnfp-new", [NAME], monkeypatch) == 0
+    assert call_command("cnfp-new", NAME) == 0
     *written, last = capsys.readouterr().out.splitlines()
     assert sorted(map(Path, written)) == sorted(
         path.relative_to(parent) for path in files_in(parent)
@@ -76,20 +67,20 @@ def test_what_is_said_to_do_next_works(
 
     assert [command for command, *_ in commands] == ["cnfp-audit", "cnfp-train"]
     for command, *arguments in commands:
-        assert run(command, [*arguments, *SHORTER[command]], monkeypatch) == 0
+        assert call_command(command, *arguments, *SHORTER[command]) == 0
     trained = capsys.readouterr().out
     assert "no flaw found" in trained
     assert "violations: speed 0" in trained
     # A run names the package that is to be trusted with it.
     for command in trained.splitlines()[-1].removeprefix("next: ").split("; "):
         command, *arguments = command.replace("'", "").split()
-        assert run(command, [*arguments, *SHORTER[command]], monkeypatch) == 0
+        assert call_command(command, *arguments, *SHORTER[command]) == 0
     assert "speed" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["folder", "empty folder", "file", "link that leads nowhere"])
 def test_what_is_there_is_not_touched(
-    kind: str, parent: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str, parent: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = parent / NAME
     if kind == "folder":
@@ -102,7 +93,7 @@ def test_what_is_there_is_not_touched(
     else:
         there.symlink_to("nowhere")
     before = files_in(parent)
-    assert run("cnfp-new", [NAME], monkeypatch) == 2
+    assert call_command("cnfp-new", NAME) == 2
     assert f"{NAME}: expected a new folder" in capsys.readouterr().err
     assert files_in(parent) == before
     assert list(parent.iterdir()) == [there]
@@ -131,13 +122,9 @@ def test_what_is_there_is_not_touched(
     ],
 )
 def test_a_name_that_would_not_work_is_refused(
-    name: str,
-    reason: str,
-    parent: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, reason: str, parent: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("cnfp-new", [name], monkeypatch) == 2
+    assert call_command("cnfp-new", name) == 2
     said = capsys.readouterr().err
     assert said.startswith("cnfp-new: error: name: expected")
     assert reason in said

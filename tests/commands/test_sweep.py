@@ -3,14 +3,18 @@
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from cnfp_torchrl.commands.sweep import main as sweep_command
-from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
+from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
+from tests.entry_points import run_command
 
 TINY = [
     "collector.total_frames=96",
@@ -25,17 +29,6 @@ TINY = [
 ]
 
 
-def run(command: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", f"cnfp_torchrl.commands.{command}", *arguments],
-        cwd=cwd,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 def table(folder: Path) -> list[dict[str, str]]:
     with (folder / "sweep.csv").open() as file:
         return list(csv.DictReader(file))
@@ -45,7 +38,7 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     sweep = tmp_path / "a=1,[b] c"
     broken = ["optim.lr=1e30,0.001", "training.update_ratio=1"]
     arguments = ["-m", *TINY, *broken, f"hydra.sweep.dir='{sweep}'"]
-    done = run("train", *arguments, cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", *arguments)
     assert done.returncode == 1
     first, second = table(sweep)
     # As soon as it has failed, and not behind the others.
@@ -58,7 +51,7 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert first["state"] in done.stdout
     # What refuses to go on with a complete run says nothing of it.
     complete = sweep / second["folder"]
-    refused = run("train", f"resume={complete}", cwd=tmp_path)
+    refused = run_command(tmp_path, "cnfp-train", f"resume={complete}")
     assert refused.returncode == 1
     assert "has finished with 96 steps" in refused.stderr
     assert RunFolder(complete).load_failure() is None
@@ -70,7 +63,7 @@ def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a sweep over three seeds, one after another."""
     folder = tmp_path_factory.mktemp("basic") / "sweep"
     arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={folder}"]
-    done = run("train", *arguments, cwd=folder.parent)
+    done = run_command(folder.parent, "cnfp-train", *arguments)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -89,17 +82,69 @@ def test_launchers_give_the_runs_that_one_after_another_gives(
     launcher: str, basic: Path, tmp_path: Path
 ) -> None:
     arguments = ["-m", *TINY, "seed=0,1,2", f"hydra.sweep.dir={tmp_path / 's'}"]
-    done = run("train", *arguments, f"hydra/launcher={launcher}", cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", *arguments, f"hydra/launcher={launcher}")
     assert done.returncode == 0, done.stderr
     assert results(tmp_path / "s") == results(basic)
     assert [row["state"] for row in table(basic)] == ["done"] * 3
+
+
+def begin_side_by_side(sweep: Path, *settings: str) -> subprocess.Popen[str]:
+    """Begin a sweep of two processes; return when its first two runs have saved a state."""
+    arguments = ["-m", *TINY, *settings, f"hydra.sweep.dir={sweep}", "hydra/launcher=parallel"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while len({path.parent for path in sweep.glob(f"*/{STATES}/state-*")}) < 2:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    return process
+
+
+def works_in(folder: Path, process: psutil.Process) -> bool:
+    """Tell whether a process holds a run's folder."""
+    files = Path(f"/proc/{process.pid}/fd").iterdir()
+    return any(file.resolve() == folder.resolve() for file in files)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are told apart by /proc")
+def test_a_killed_process_takes_no_run_with_it(tmp_path: Path) -> None:
+    sweep = tmp_path / "s"
+    longer = ["collector.total_frames=960", "checkpoint.interval=48", "hydra.launcher.n_jobs=2"]
+    process = begin_side_by_side(sweep, *longer, "seed=0,1,2")
+    workers = psutil.Process(process.pid).children()
+    (killed,) = (each for each in workers if works_in(sweep / "0_seed-0", each))
+    killed.kill()
+    _, told = process.communicate()
+    assert process.returncode == 0, told
+    assert "a process was killed" in told
+    assert [row["state"] for row in table(sweep)] == ["done"] * 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_runs_side_by_side_when_they_are_saved(number: int, tmp_path: Path) -> None:
+    sweep = tmp_path / "s"
+    endless = ["collector.total_frames=1000000", "checkpoint.interval=48"]
+    process = begin_side_by_side(sweep, *endless, "hydra.launcher.n_jobs=2", "seed=0,1,2")
+    os.killpg(process.pid, number)
+    _, told = process.communicate()
+    assert process.returncode == 128 + number, told
+    assert told.count("stopped and saved at step") == 2
+    states = [row["state"] for row in table(sweep)]
+    assert [state.partition(":")[0] for state in states] == ["stopped", "stopped", "not started"]
 
 
 @pytest.mark.slow
 def test_a_study_finds_no_run_that_broke_a_constraint(tmp_path: Path) -> None:
     study = ["hydra/sweeper=study", "hydra.sweeper.n_trials=6", f"hydra.sweep.dir={tmp_path / 's'}"]
     varied = ["flow=exact,unconstrained", "optim.lr=tag(log,interval(1e-4,1e-2))"]
-    done = run("train", "-m", *TINY, *study, *varied, cwd=tmp_path)
+    done = run_command(tmp_path, "cnfp-train", "-m", *TINY, *study, *varied)
     assert done.returncode == 0, done.stderr
     rows = table(tmp_path / "s")
     assert {row["flow"] for row in rows} == {"exact", "unconstrained"}
@@ -133,8 +178,8 @@ def test_a_job_that_slurm_starts_again_goes_on(
     shutil.copytree(basic / table(basic)[0]["folder"], tmp_path / "run")
     (tmp_path / "run" / SUMMARY).unlink()
     arguments = [*TINY, "seed=0", f"hydra.run.dir={tmp_path / 'run'}"]
-    assert "holds ['config.yaml'" in run("train", *arguments, cwd=tmp_path).stderr
+    assert "holds ['config.yaml'" in run_command(tmp_path, "cnfp-train", *arguments).stderr
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    again = run("train", *arguments, cwd=tmp_path)
+    again = run_command(tmp_path, "cnfp-train", *arguments)
     assert again.returncode == 0, again.stderr
     assert "goes on at step 96" in again.stderr

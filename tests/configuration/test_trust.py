@@ -28,7 +28,7 @@ from cnfp_torchrl.configuration.trust import (
 )
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.run_folder import CONFIG, RunFolder
-from tests.entry_points import load_command
+from tests.entry_points import call_command
 from tests.payload import Payload
 
 PATH = Path("run/config.yaml")
@@ -363,16 +363,10 @@ def test_the_evil_file_would_run_code(evil_run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_refuses(
-    command: str,
-    evil_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    command: str, evil_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = [key.format(run=evil_run, place=tmp_path / "out") for key in COMMANDS[command]]
-    monkeypatch.setattr(sys, "argv", [command, *given])
-    with pytest.raises(SystemExit):
-        load_command(command)()
+    assert call_command(command, *given)
     said = capsys.readouterr().err
     assert CALL in said
     assert str(evil_run / CONFIG) in said

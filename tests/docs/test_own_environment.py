@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.entry_points import load_command
+from tests.entry_points import call_command
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "own_environment.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
@@ -35,21 +35,14 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     sys.modules.pop(MODULE.stem, None)
 
 
-def run(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
+def run(line: str) -> int:
     """Run a command, with fewer steps than it says, and return its exit status."""
     command, *arguments = shlex.split(line)
-    monkeypatch.setattr(sys, "argv", [command, *arguments, *SHORTER[command]])
     sys.modules.pop(MODULE.stem, None)
-    try:
-        load_command(command)()
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
+    return call_command(command, *arguments, *SHORTER[command])
 
 
-def test_the_document_runs(
-    own_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_document_runs(own_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said, statuses = [], []
     *blocks, (_, in_python) = BLOCKS
     for language, body in blocks:
@@ -62,7 +55,7 @@ def test_the_document_runs(
         elif language == "sh":
             for line in body.splitlines():
                 if line.startswith("cnfp-"):
-                    statuses.append(run(line, monkeypatch))
+                    statuses.append(run(line))
                     said.append(capsys.readouterr().out)
     trained, evaluated, explained, *audited, slipped = said
     assert statuses == [0, 0, 0, 0, 0, 0, 3]

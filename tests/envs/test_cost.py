@@ -48,10 +48,23 @@ def test_costs_and_their_sum(batch_size: tuple[int, ...], indicators: dict | Non
         assert torch.equal(episode["next", "episode_cost"], total)
 
 
+class Renamed(PointNavEnv):
+    constraint_names = ("wall", "battery")
+
+
 def test_names_through_a_stack() -> None:
     env = TransformedEnv(PointNavEnv(), ConstraintCost())
     assert env.transform.constraint_names == ("obstacle", "battery")
     assert constraint_names(PointNavEnv()) == ("obstacle", "battery")
+    several = SerialEnv(2, PointNavEnv)
+    several.reset()
+    assert constraint_names(TransformedEnv(several, ConstraintCost())) == ("obstacle", "battery")
+    several.close()
+    others = SerialEnv(2, [PointNavEnv, Renamed])
+    others.reset()
+    with pytest.raises(ValueError, match="expected environments with the same constraint_names"):
+        constraint_names(others)
+    others.close()
     with pytest.raises(ValueError, match="expected one that names its constraints"):
         constraint_names(GymEnv("Pendulum-v1"))
     with pytest.raises(RuntimeError, match="expected indicators or an environment"):

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.geometry.cases import CASES, FAMILIES, Case
+from experiments.random_sets import FAMILIES
+from tests.geometry.cases import CASES, Case
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from tests.modules.point_nav import STATES, make_env
+from tests.point_nav import STATES, make_env
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ from cnfp_torchrl.modules import (
     with_reference_entropy,
 )
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from tests.modules.point_nav import BIJECTORS, inside, make_actor, make_network, make_tanh_actor
+from tests.point_nav import BIJECTORS, inside, make_actor, make_network, make_tanh_actor
 
 # Of the box squash, whose bounds are moved inwards by 16 rounding errors (`Box.eroded`).
 EROSION = 16 * torch.finfo(torch.float32).eps

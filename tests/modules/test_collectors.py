@@ -18,7 +18,7 @@ from cnfp_torchrl.envs import constraint_bijectors
 from cnfp_torchrl.modules import WarmUpPolicy, guarded, make_constrained_actor, split_at_latent
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.networks import gaussian_network
-from tests.modules.point_nav import make_actor, make_network
+from tests.point_nav import make_actor, make_network
 
 AGENTS, STEPS = 8, 5
 

@@ -25,7 +25,7 @@ from cnfp_torchrl.modules import (
     split_at_latent,
 )
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from tests.modules.point_nav import make_actor, make_tanh_actor
+from tests.point_nav import make_actor, make_tanh_actor
 
 SPEC = Bounded(-1.0, 1.0, (2,))
 NOISES = [

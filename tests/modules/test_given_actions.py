@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 from cnfp_torchrl.bijectors import well_inside
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.modules import LostDensityWarning, flow_head, split_at_latent
-from tests.modules.point_nav import STATES, make_actor
+from tests.point_nav import STATES, make_actor
 
 FLOWS = ["exact", "gauge", "radial", "unconstrained"]
 DEPTH = 1e-3

@@ -16,7 +16,7 @@ from cnfp_torchrl.modules import (
     flow_head,
     guarded,
 )
-from tests.modules.point_nav import make_actor, make_tanh_actor
+from tests.point_nav import make_actor, make_tanh_actor
 
 AGENT = 2
 

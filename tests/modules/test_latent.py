@@ -26,7 +26,7 @@ from cnfp_torchrl.modules import (
     split_at_latent,
     with_reference_entropy,
 )
-from tests.modules.point_nav import inside, make_actor, make_tanh_actor
+from tests.point_nav import inside, make_actor, make_tanh_actor
 
 
 class Gaussian(nn.Module):

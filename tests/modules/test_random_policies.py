@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cnfp_torchrl.modules import SafeRandomPolicy, WarmUpPolicy, flow_head
-from tests.modules.point_nav import inside, make_actor, make_tanh_actor
+from tests.point_nav import inside, make_actor, make_tanh_actor
 
 AGENTS = 8
 
@@ -85,9 +85,7 @@ def test_it_switches_after_the_stated_frames(env: TransformedEnv, frames: int, s
     assert random_steps(rollout) == [step < steps for step in range(6)]
 
 
-def test_unbatched_environments_count_single_frames(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_unbatched_environments_count_single_frames(state: TensorDictBase) -> None:
     policy = WarmUpPolicy(make_actor(Marked()), 2)
     assert [bool((policy(state[0].clone())["loc"] == 0).all()) for _ in range(4)] == [
         True,

@@ -25,8 +25,7 @@ from cnfp_torchrl.modules import with_reference_entropy
 from cnfp_torchrl.objectives import BatchedSACLoss
 from cnfp_torchrl.objectives.stacked_perceptron import StackedPerceptron
 from cnfp_torchrl.training.networks import action_cost_network, action_value_network
-
-MakeActor = Callable[..., Any]
+from tests.point_nav import make_actor
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -81,16 +80,12 @@ def tanh_normal_actor() -> ProbabilisticActor:
     )
 
 
-@pytest.fixture
-def make_any_actor(make_actor: MakeActor) -> MakeActor:
-    def make(kind: str) -> Any:
-        if kind == "TanhNormal":
-            return tanh_normal_actor()
-        flow, _, reference = kind.partition(", ")
-        actor = make_actor(flow=flow)
-        return with_reference_entropy(actor) if reference else actor
-
-    return make
+def make_any_actor(kind: str) -> Any:
+    if kind == "TanhNormal":
+        return tanh_normal_actor()
+    flow, _, reference = kind.partition(", ")
+    actor = make_actor(flow=flow)
+    return with_reference_entropy(actor) if reference else actor
 
 
 @pytest.fixture
@@ -167,7 +162,7 @@ def assert_equal(losses: list[SACLoss], batch: TensorDictBase) -> None:
     "actor", ["TanhNormal", "unconstrained", "exact", "exact, reference", "squash", "radial"]
 )
 def test_it_equals_torchrl_s_for_any_actor_and_critic(
-    make_any_actor: MakeActor, batch: TensorDictBase, actor: str, critic: str
+    batch: TensorDictBase, actor: str, critic: str
 ) -> None:
     losses = both(make_any_actor(actor), CRITICS[critic]())
     assert_equal(losses, batch)
@@ -193,9 +188,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
-def test_it_equals_torchrl_s_for_any_option(
-    make_any_actor: MakeActor, batch: TensorDictBase, options: dict[str, Any]
-) -> None:
+def test_it_equals_torchrl_s_for_any_option(batch: TensorDictBase, options: dict[str, Any]) -> None:
     critic = CRITICS["perceptron"]()
     assert_equal(both(make_any_actor("exact, reference"), critic, **options), batch)
 
@@ -209,16 +202,14 @@ def test_it_equals_torchrl_s_for_any_option(
     ],
 )
 def test_it_equals_torchrl_s_for_any_value_estimator(
-    make_any_actor: MakeActor, batch: TensorDictBase, estimator: dict[str, Any]
+    batch: TensorDictBase, estimator: dict[str, Any]
 ) -> None:
     critic = CRITICS["perceptron"]()
     losses = both(make_any_actor("unconstrained"), critic, estimator=estimator)
     assert_equal(losses, batch.reshape(16, 16))
 
 
-def test_it_equals_torchrl_s_with_several_steps_priorities_and_masks(
-    make_any_actor: MakeActor, batch: TensorDictBase
-) -> None:
+def test_it_equals_torchrl_s_with_several_steps_priorities_and_masks(batch: TensorDictBase) -> None:
     losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     batch["steps_to_next_obs"] = torch.randint(1, 4, (256, 1))
     assert_equal(losses, batch)
@@ -230,7 +221,7 @@ def test_it_equals_torchrl_s_with_several_steps_priorities_and_masks(
 
 @pytest.mark.parametrize("shape", [(256,), (1, 256), (8, 32), (2, 16, 8)])
 def test_it_equals_torchrl_s_for_any_batch_shape(
-    make_any_actor: MakeActor, batch: TensorDictBase, shape: tuple[int, ...]
+    batch: TensorDictBase, shape: tuple[int, ...]
 ) -> None:
     losses = both(make_any_actor("exact"), CRITICS["perceptron"]())
     assert_equal(losses, batch.reshape(shape))
@@ -238,13 +229,13 @@ def test_it_equals_torchrl_s_for_any_batch_shape(
 
 @pytest.mark.parametrize("size", [1, 7, 8, 10])
 def test_it_equals_torchrl_s_for_any_number_of_transitions(
-    make_any_actor: MakeActor, batch: TensorDictBase, size: int
+    batch: TensorDictBase, size: int
 ) -> None:
     losses = both(make_any_actor("exact, reference"), CRITICS["perceptron"]())
     assert_equal(losses, batch[:size])
 
 
-def test_it_equals_torchrl_s_in_float64(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
+def test_it_equals_torchrl_s_in_float64(batch: TensorDictBase) -> None:
     losses = both(make_any_actor("TanhNormal"), CRITICS["perceptron"]())
     for loss in losses:
         loss(batch.clone())  # what it remembers of before is not taken for what comes after
@@ -252,9 +243,7 @@ def test_it_equals_torchrl_s_in_float64(make_any_actor: MakeActor, batch: Tensor
     assert_equal(losses, batch.apply(lambda x: x.double() if x.is_floating_point() else x))
 
 
-def test_it_equals_torchrl_s_under_other_keys(
-    make_any_actor: MakeActor, batch: TensorDictBase
-) -> None:
+def test_it_equals_torchrl_s_under_other_keys(batch: TensorDictBase) -> None:
     losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     renamed = {"reward": "gain", "terminated": "over", "done": "ended", "priority": "surprise"}
     for name, other in renamed.items():
@@ -268,9 +257,7 @@ def test_it_equals_torchrl_s_under_other_keys(
 
 
 @pytest.mark.parametrize("batched", [True, False])
-def test_critics_write_under_another_key(
-    make_any_actor: MakeActor, batch: TensorDictBase, batched: bool
-) -> None:
+def test_critics_write_under_another_key(batch: TensorDictBase, batched: bool) -> None:
     network = MLP(in_features=7, out_features=1, num_cells=[8]) if batched else OwnCritic()
     critic = TensorDictModule(network, ["observation", "action"], ["value"])
     losses = both(make_any_actor("unconstrained"), critic)
@@ -281,7 +268,7 @@ def test_critics_write_under_another_key(
     assert_equal(losses, batch)
 
 
-def test_it_is_called_with_tensors(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
+def test_it_is_called_with_tensors(batch: TensorDictBase) -> None:
     results = []
     for loss in both(make_any_actor("unconstrained"), CRITICS["perceptron"]()):
         torch.manual_seed(1)
@@ -310,7 +297,7 @@ def trained(loss: SACLoss, batch: TensorDictBase, updates: int = 20) -> SACLoss:
     return loss
 
 
-def test_training_goes_as_with_torchrl_s(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
+def test_training_goes_as_with_torchrl_s(batch: TensorDictBase) -> None:
     actor = make_any_actor("exact")
     losses = both(actor, CRITICS["perceptron"]())
     ours = both(copy.deepcopy(actor), CRITICS["perceptron"]())[1]
@@ -328,7 +315,7 @@ def test_training_goes_as_with_torchrl_s(make_any_actor: MakeActor, batch: Tenso
 )
 @pytest.mark.parametrize("critic", ["perceptron", "of its own"])
 def test_a_copy_learns_and_leaves_the_original_alone(
-    make_any_actor: MakeActor, batch: TensorDictBase, critic: str, copied: Callable[[Any], Any]
+    batch: TensorDictBase, critic: str, copied: Callable[[Any], Any]
 ) -> None:
     first = both(make_any_actor("exact"), CRITICS[critic]())[1]
     first(batch.clone())  # so that it remembers something
@@ -351,7 +338,7 @@ def test_a_copy_learns_and_leaves_the_original_alone(
     assert_equal([fresh, second], batch)
 
 
-def test_it_survives_saving_and_loading(make_any_actor: MakeActor, batch: TensorDictBase) -> None:
+def test_it_survives_saving_and_loading(batch: TensorDictBase) -> None:
     first = trained(both(make_any_actor("exact"), CRITICS["perceptron"]())[1], batch, 2)
     second = BatchedSACLoss(make_any_actor("exact"), CRITICS["perceptron"](), action_spec=SPEC)
     second.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
@@ -360,9 +347,7 @@ def test_it_survives_saving_and_loading(make_any_actor: MakeActor, batch: Tensor
     assert_equal([first, second], batch)
 
 
-def test_the_caller_s_tensordict_gains_the_priority_alone(
-    make_any_actor: MakeActor, batch: TensorDictBase
-) -> None:
+def test_the_caller_s_tensordict_gains_the_priority_alone(batch: TensorDictBase) -> None:
     loss = both(make_any_actor("exact"), CRITICS["perceptron"]())[1]
     before = batch.clone()
     loss(batch)
@@ -431,9 +416,7 @@ def test_other_networks_are_left_to_vmap(network: nn.Module) -> None:
     assert StackedPerceptron.of(network) is None
 
 
-def test_the_base_of_the_comparison_is_sensitive(
-    make_any_actor: MakeActor, batch: TensorDictBase
-) -> None:
+def test_the_base_of_the_comparison_is_sensitive(batch: TensorDictBase) -> None:
     losses = both(make_any_actor("unconstrained"), CRITICS["perceptron"]())
     with torch.no_grad():
         next(iter(losses[1].target_qvalue_network_params.values(True, True)))[1].mul_(1.01)
@@ -441,7 +424,7 @@ def test_the_base_of_the_comparison_is_sensitive(
         assert_equal(losses, batch)
 
 
-def test_tensordicts_of_other_entries_are_fine(make_any_actor: MakeActor) -> None:
+def test_tensordicts_of_other_entries_are_fine() -> None:
     """Observations without geometry, on an actor that needs none, as any TorchRL user has them."""
     data = TensorDict(
         {

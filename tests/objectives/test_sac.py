@@ -11,15 +11,13 @@ from torch import Tensor
 from torch.linalg import vector_norm
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from cnfp_torchrl.geometry import Box
 from cnfp_torchrl.modules import flow_head, with_reference_entropy
 from cnfp_torchrl.objectives import ConstrainedSACLoss, SACLagrangianLoss, usual_target_entropy
 from cnfp_torchrl.training.networks import action_cost_network
-
-MakeActor = Callable[..., Any]
+from tests.point_nav import SPEC, make_actor, make_critic
 
 # Most tests evaluate a loss once, without stepping its target networks.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -58,15 +56,10 @@ def evaluated(loss: SACLoss, transitions: TensorDictBase) -> TensorDictBase:
 @ALL_LOSSES
 @pytest.mark.parametrize("flow", FLOWS)
 def test_gradients_reach_every_parameter(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-    make_loss: Callable[..., SACLoss],
-    flow: str,
+    transitions: TensorDictBase, make_loss: Callable[..., SACLoss], flow: str
 ) -> None:
     actor = make_actor(flow=flow)
-    loss = make_loss(actor, critic, action_spec=env.action_spec_unbatched)
+    loss = make_loss(actor, make_critic(), action_spec=SPEC)
     losses = loss(transitions)
     assert all(value.isfinite().all() for value in losses.values())
     total(losses).backward()
@@ -80,14 +73,10 @@ def test_gradients_reach_every_parameter(
 
 @ALL_LOSSES
 def test_the_actor_itself_learns(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-    make_loss: Callable[..., SACLoss],
+    transitions: TensorDictBase, make_loss: Callable[..., SACLoss]
 ) -> None:
     actor = make_actor()
-    loss = make_loss(actor, critic, action_spec=env.action_spec_unbatched)
+    loss = make_loss(actor, make_critic(), action_spec=SPEC)
     mine = {parameter.data_ptr() for parameter in actor.parameters()}
     trained = {parameter.data_ptr() for parameter in loss.actor_network_params.parameters()}
     assert mine == trained
@@ -102,13 +91,9 @@ def test_the_actor_itself_learns(
 
 @ALL_LOSSES
 def test_target_networks_follow(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-    make_loss: Callable[..., SACLoss],
+    transitions: TensorDictBase, make_loss: Callable[..., SACLoss]
 ) -> None:
-    loss = make_loss(make_actor(), critic, action_spec=env.action_spec_unbatched)
+    loss = make_loss(make_actor(), make_critic(), action_spec=SPEC)
     target = SoftUpdate(loss, tau=0.25)
     before = loss.target_qvalue_network_params.data.clone()
     total(loss(transitions)).backward()
@@ -123,33 +108,22 @@ def test_target_networks_follow(
 
 
 @ALL_LOSSES
-def test_the_target_entropy_is_minus_the_action_size(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    make_loss: Callable[..., SACLoss],
-) -> None:
-    loss = make_loss(make_actor(), critic, action_spec=env.action_spec_unbatched)
+def test_the_target_entropy_is_minus_the_action_size(make_loss: Callable[..., SACLoss]) -> None:
+    loss = make_loss(make_actor(), make_critic(), action_spec=SPEC)
     assert float(loss.target_entropy) == -2
 
 
 @pytest.mark.parametrize("entropy", ["reference", "action"])
-def test_vmap_changes_nothing(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-    entropy: str,
-) -> None:
+def test_vmap_changes_nothing(transitions: TensorDictBase, entropy: str) -> None:
     results = []
     actor = make_actor()
     for deactivated in (False, True):
         torch.manual_seed(0)  # of the second critic's weights
         loss = ConstrainedSACLoss(
             actor,
-            critic,
+            make_critic(),
             entropy=entropy,
-            action_spec=env.action_spec_unbatched,
+            action_spec=SPEC,
             deactivate_vmap=deactivated,
         )
         results.append(evaluated(loss, transitions))
@@ -160,11 +134,9 @@ def test_vmap_changes_nothing(
 # Projected actions, which have no density --------------------------------------------------------
 
 
-def test_projected_actions_learn_by_the_reference_entropy(
-    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, transitions: TensorDictBase
-) -> None:
+def test_projected_actions_learn_by_the_reference_entropy(transitions: TensorDictBase) -> None:
     actor = make_actor(flow="projection")
-    losses = ConstrainedSACLoss(actor, critic, action_spec=env.action_spec_unbatched)(transitions)
+    losses = ConstrainedSACLoss(actor, make_critic(), action_spec=SPEC)(transitions)
     total(losses).backward()
     for parameter in actor.parameters():
         assert parameter.grad.isfinite().all()
@@ -180,11 +152,9 @@ def test_projected_actions_learn_by_the_reference_entropy(
 
 
 @pytest.mark.parametrize("lagrangian", [False, True], ids=["sac", "lagrangian"])
-def test_the_entropy_of_projected_actions_is_refused(
-    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, lagrangian: bool
-) -> None:
-    networks = [make_actor(flow="projection"), critic]
-    options: dict[str, Any] = {"entropy": "action", "action_spec": env.action_spec_unbatched}
+def test_the_entropy_of_projected_actions_is_refused(lagrangian: bool) -> None:
+    networks = [make_actor(flow="projection"), make_critic()]
+    options: dict[str, Any] = {"entropy": "action", "action_spec": SPEC}
     make_loss: type[SACLoss] = ConstrainedSACLoss
     if lagrangian:
         make_loss = SACLagrangianLoss
@@ -204,9 +174,7 @@ def share(actor: Any, transitions: TensorDictBase, latent: Tensor) -> Tensor:
     return vector_norm(stages[-1] - anchor, dim=-1) / vector_norm(stages[0] - anchor, dim=-1)
 
 
-def test_the_reference_leaves_the_retractions_out(
-    make_actor: MakeActor, transitions: TensorDictBase
-) -> None:
+def test_the_reference_leaves_the_retractions_out(transitions: TensorDictBase) -> None:
     actor = make_actor(flow="gauge")  # whose share has the plain formula
     reference = with_reference_entropy(actor)
     drawn = []
@@ -224,9 +192,7 @@ def test_the_reference_leaves_the_retractions_out(
     torch.testing.assert_close(reference_log_prob - log_prob, 2 * s.log(), rtol=1e-3, atol=1e-3)
 
 
-def test_log_prob_is_the_true_density_with_either(
-    make_actor: MakeActor, transitions: TensorDictBase
-) -> None:
+def test_log_prob_is_the_true_density_with_either(transitions: TensorDictBase) -> None:
     actor = make_actor()
     densities = [
         policy.get_dist(transitions.clone()) for policy in (actor, with_reference_entropy(actor))
@@ -235,22 +201,16 @@ def test_log_prob_is_the_true_density_with_either(
     assert torch.equal(densities[1].log_prob(action), densities[0].log_prob(action))
 
 
-def test_the_loss_rewards_the_entropy_that_was_chosen(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-) -> None:
+def test_the_loss_rewards_the_entropy_that_was_chosen(transitions: TensorDictBase) -> None:
+    critic = make_critic()
     actor = make_actor(flow="gauge")
     losses = {
-        entropy: ConstrainedSACLoss(
-            actor, critic, entropy=entropy, action_spec=env.action_spec_unbatched
-        )
+        entropy: ConstrainedSACLoss(actor, critic, entropy=entropy, action_spec=SPEC)
         for entropy in ("reference", "action")
     }
     entropies = {name: evaluated(loss, transitions)["entropy"] for name, loss in losses.items()}
-    default = ConstrainedSACLoss(actor, critic, action_spec=env.action_spec_unbatched)
-    plain = SACLoss(actor, critic, action_spec=env.action_spec_unbatched)
+    default = ConstrainedSACLoss(actor, critic, action_spec=SPEC)
+    plain = SACLoss(actor, critic, action_spec=SPEC)
     assert torch.equal(evaluated(default, transitions)["entropy"], entropies["reference"])
     assert torch.equal(evaluated(plain, transitions)["entropy"], entropies["action"])
 
@@ -265,18 +225,10 @@ def test_the_loss_rewards_the_entropy_that_was_chosen(
 
 
 @pytest.mark.parametrize("flow", ["squash", "unconstrained"])
-def test_without_retractions_the_entropies_agree(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    transitions: TensorDictBase,
-    flow: str,
-) -> None:
+def test_without_retractions_the_entropies_agree(transitions: TensorDictBase, flow: str) -> None:
     actor, entropies = make_actor(flow=flow), []
     for entropy in ("reference", "action"):
-        loss = ConstrainedSACLoss(
-            actor, critic, entropy=entropy, action_spec=env.action_spec_unbatched
-        )
+        loss = ConstrainedSACLoss(actor, make_critic(), entropy=entropy, action_spec=SPEC)
         entropies.append(evaluated(loss, transitions)["entropy"])
     assert torch.equal(*entropies)
 
@@ -284,13 +236,11 @@ def test_without_retractions_the_entropies_agree(
 # Settings -----------------------------------------------------------------------------------------
 
 
-def test_the_discount_is_used(
-    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, transitions: TensorDictBase
-) -> None:
+def test_the_discount_is_used(transitions: TensorDictBase) -> None:
     actor, results = make_actor(), {}
     for gamma in (0.0, 0.5, 0.99):
         torch.manual_seed(0)  # of the second critic's weights
-        loss = ConstrainedSACLoss(actor, critic, gamma=gamma, action_spec=env.action_spec_unbatched)
+        loss = ConstrainedSACLoss(actor, make_critic(), gamma=gamma, action_spec=SPEC)
         results[gamma] = float(evaluated(loss, transitions)["loss_qvalue"].detach())
     assert len(set(results.values())) == 3
 
@@ -304,22 +254,17 @@ def test_the_discount_is_used(
         ({"gamma": float("nan")}, r"gamma: expected a discount in \[0, 1\), given nan"),
     ],
 )
-def test_unknown_settings_are_refused(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    options: dict[str, Any],
-    message: str,
-) -> None:
+def test_unknown_settings_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ConstrainedSACLoss(make_actor(), critic, action_spec=env.action_spec_unbatched, **options)
+        ConstrainedSACLoss(make_actor(), make_critic(), action_spec=SPEC, **options)
 
 
 @pytest.mark.parametrize("entropy", ["reference", "action"])
 def test_the_target_entropy_is_that_of_one_action_whatever_the_spec(
-    env: TransformedEnv, make_actor: MakeActor, critic: ValueOperator, entropy: str
+    env: TransformedEnv, entropy: str
 ) -> None:
-    for spec in (env.action_spec, env.full_action_spec, env.action_spec_unbatched, None):
+    critic = make_critic()
+    for spec in (env.action_spec, env.full_action_spec, SPEC, None):
         loss = ConstrainedSACLoss(make_actor(), critic, entropy=entropy, action_spec=spec)
         assert float(loss.target_entropy) == -2
     loss = ConstrainedSACLoss(make_actor(), critic, entropy=entropy, target_entropy=-4.0)

@@ -1,25 +1,19 @@
 """SAC-Lagrangian against a re-implementation in plain PyTorch, its multipliers, its training."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.nn import functional
-from torchrl.envs import TransformedEnv
-from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from cnfp_torchrl.modules import with_reference_entropy
 from cnfp_torchrl.objectives import SACLagrangianLoss
 from cnfp_torchrl.training.networks import action_cost_network
+from tests.point_nav import SPEC, make_actor, make_critic, same_weights
 from tests.training.conftest import TinyRun
-
-MakeActor = Callable[..., Any]
-MakeLoss = Callable[..., SACLagrangianLoss]
 
 # Most tests evaluate a loss once, without stepping its target networks.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -35,23 +29,11 @@ REACHED = {
 LOSSES = list(REACHED)
 
 
-@pytest.fixture
-def cost_critic() -> TensorDictModule:
-    return action_cost_network(5, 2, 2, hidden=[8])
-
-
-@pytest.fixture
-def make_loss(
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-    cost_critic: TensorDictModule,
-) -> MakeLoss:
-    def make(actor: Any = None, **options: Any) -> SACLagrangianLoss:
-        settings = {"thresholds": [0.1, 0.2], "action_spec": env.action_spec_unbatched} | options
-        return SACLagrangianLoss(actor or make_actor(), critic, cost_critic, **settings)
-
-    return make
+@same_weights()
+def make_loss(actor: Any = None, **options: Any) -> SACLagrangianLoss:
+    settings = {"thresholds": [0.1, 0.2], "action_spec": SPEC} | options
+    networks = actor or make_actor(), make_critic(), action_cost_network(5, 2, 2, hidden=[8])
+    return SACLagrangianLoss(*networks, **settings)
 
 
 @pytest.fixture
@@ -142,8 +124,6 @@ def plain_losses(
 @pytest.mark.parametrize("flow", ["exact", "unconstrained"])
 @pytest.mark.parametrize("deactivate_vmap", [False, True])
 def test_values_and_gradients_are_those_of_the_formulas(
-    make_actor: MakeActor,
-    make_loss: MakeLoss,
     batch: TensorDictBase,
     nets: int,
     entropy: str,
@@ -203,7 +183,7 @@ def test_values_and_gradients_are_those_of_the_formulas(
 # Multipliers --------------------------------------------------------------------------------------
 
 
-def test_multipliers_rise_above_the_threshold_and_fall_below(make_loss: MakeLoss) -> None:
+def test_multipliers_rise_above_the_threshold_and_fall_below() -> None:
     loss = make_loss(lambda_init=1.0, lambda_max=3.0)
     optimizer = torch.optim.Adam([loss.log_lagrange], lr=0.1)
     history = [loss.multipliers]
@@ -226,14 +206,14 @@ def test_multipliers_rise_above_the_threshold_and_fall_below(make_loss: MakeLoss
     assert loss.multipliers[0] < 3.0
 
 
-def test_a_threshold_at_the_cost_changes_nothing(make_loss: MakeLoss) -> None:
+def test_a_threshold_at_the_cost_changes_nothing() -> None:
     loss = make_loss()
     loss.lagrange_loss(loss.thresholds.clone()).backward()
     assert not loss.log_lagrange.grad.any()
 
 
 @pytest.mark.parametrize("bound", [1e-3, 0.1, 7.0, 100.0, 12345.0])
-def test_the_bound_holds_exactly(make_loss: MakeLoss, bound: float) -> None:
+def test_the_bound_holds_exactly(bound: float) -> None:
     loss = make_loss(lambda_init=bound, lambda_max=bound)
     with torch.no_grad():
         loss.log_lagrange.fill_(50.0)
@@ -244,7 +224,7 @@ def test_the_bound_holds_exactly(make_loss: MakeLoss, bound: float) -> None:
 # Training -----------------------------------------------------------------------------------------
 
 
-def test_the_cost_critic_s_target_follows(make_loss: MakeLoss, batch: TensorDictBase) -> None:
+def test_the_cost_critic_s_target_follows(batch: TensorDictBase) -> None:
     loss = make_loss()
     target = SoftUpdate(loss, tau=0.25)
     before = loss.target_cost_network_params.data.clone()
@@ -258,9 +238,7 @@ def test_the_cost_critic_s_target_follows(make_loss: MakeLoss, batch: TensorDict
         assert not torch.equal(after[key], before[key])
 
 
-def test_the_cost_critic_learns_the_discounted_costs(
-    make_loss: MakeLoss, batch: TensorDictBase
-) -> None:
+def test_the_cost_critic_learns_the_discounted_costs(batch: TensorDictBase) -> None:
     loss = make_loss(gamma_cost=0.5)
     batch["next", "cost"][:, 0], batch["next", "cost"][:, 1] = 1.0, 0.0
     batch["next", "terminated"][:] = False
@@ -276,9 +254,7 @@ def test_the_cost_critic_learns_the_discounted_costs(
     assert float(losses["cost_value_1"]) == pytest.approx(0.0, abs=0.2)
 
 
-def test_the_cost_critic_learns_a_mean_of_rare_costs(
-    make_loss: MakeLoss, batch: TensorDictBase
-) -> None:
+def test_the_cost_critic_learns_a_mean_of_rare_costs(batch: TensorDictBase) -> None:
     # A robust loss would learn something like the median, 0.5 where the mean is 2.
     loss = make_loss(gamma_cost=0.0)
     batch["observation"][:] = 0.0
@@ -293,9 +269,7 @@ def test_the_cost_critic_learns_a_mean_of_rare_costs(
     torch.testing.assert_close(learned.mean(0), batch["next", "cost"].mean(0), rtol=0, atol=0.1)
 
 
-def test_costs_are_never_promised_to_be_negative(
-    make_loss: MakeLoss, batch: TensorDictBase
-) -> None:
+def test_costs_are_never_promised_to_be_negative(batch: TensorDictBase) -> None:
     loss = make_loss()
     with torch.no_grad():
         for value in loss.cost_network_params.values(True, True):
@@ -305,9 +279,7 @@ def test_costs_are_never_promised_to_be_negative(
     assert float(losses["cost_value_1"]) >= 0
 
 
-def test_a_price_moves_the_actor_away_from_costs(
-    make_loss: MakeLoss, batch: TensorDictBase
-) -> None:
+def test_a_price_moves_the_actor_away_from_costs(batch: TensorDictBase) -> None:
     loss = make_loss(lambda_init=1000.0, lambda_max=1000.0)
     optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), lr=0.01)
     costs = []
@@ -320,7 +292,7 @@ def test_a_price_moves_the_actor_away_from_costs(
     assert costs[-1] < costs[0] - 0.01
 
 
-def test_it_survives_saving_and_loading(make_loss: MakeLoss, batch: TensorDictBase) -> None:
+def test_it_survives_saving_and_loading(batch: TensorDictBase) -> None:
     first = make_loss()
     with torch.no_grad():
         first.log_lagrange.fill_(0.7)
@@ -334,7 +306,7 @@ def test_it_survives_saving_and_loading(make_loss: MakeLoss, batch: TensorDictBa
         torch.testing.assert_close(results[1][name], value, msg=name)
 
 
-def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDictBase) -> None:
+def test_costs_are_read_under_another_key(batch: TensorDictBase) -> None:
     loss = make_loss()
     loss.set_keys(cost="harm")
     assert ("next", "harm") in loss.in_keys
@@ -345,7 +317,7 @@ def test_costs_are_read_under_another_key(make_loss: MakeLoss, batch: TensorDict
 # Settings -----------------------------------------------------------------------------------------
 
 
-def test_one_threshold_is_that_of_all_constraints(make_loss: MakeLoss) -> None:
+def test_one_threshold_is_that_of_all_constraints() -> None:
     loss = make_loss(thresholds=0.3, constraint_names=["obstacle", "battery"])
     assert loss.thresholds.tolist() == pytest.approx([0.3, 0.3])
 
@@ -371,14 +343,12 @@ def test_one_threshold_is_that_of_all_constraints(make_loss: MakeLoss) -> None:
         ({"entropy": "none"}, "entropy: expected 'reference' or 'action', given 'none'"),
     ],
 )
-def test_bad_settings_are_refused(
-    make_loss: MakeLoss, options: dict[str, Any], message: str
-) -> None:
+def test_bad_settings_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_loss(**options)
 
 
-def test_costs_of_another_shape_are_refused(make_loss: MakeLoss, batch: TensorDictBase) -> None:
+def test_costs_of_another_shape_are_refused(batch: TensorDictBase) -> None:
     with pytest.raises(ValueError, match=r"cost_network: .*\['0', '1', '2'\], given 2"):
         make_loss(thresholds=[0.1] * 3)(batch.clone())
     batch["next", "cost"] = torch.zeros(256, 3)

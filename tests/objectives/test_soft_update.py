@@ -7,25 +7,19 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from torchrl.envs import TransformedEnv
-from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from cnfp_torchrl.objectives import ConstrainedSACLoss, FusedSoftUpdate, SACLagrangianLoss
 from cnfp_torchrl.training.networks import action_cost_network
+from tests.point_nav import SPEC, make_actor, make_critic
 
-MakeActor = Callable[..., Any]
 TARGETS = ("target_qvalue_network_params", "target_cost_network_params")
 
 
 @pytest.fixture(params=["torchrl", "constrained", "lagrangian"])
-def loss(
-    request: pytest.FixtureRequest,
-    env: TransformedEnv,
-    make_actor: MakeActor,
-    critic: ValueOperator,
-) -> SACLoss:
-    options = {"action_spec": env.action_spec_unbatched}
+def loss(request: pytest.FixtureRequest) -> SACLoss:
+    critic = make_critic()
+    options = {"action_spec": SPEC}
     if request.param == "torchrl":
         return SACLoss(make_actor(), critic, **options)
     if request.param == "constrained":

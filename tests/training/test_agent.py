@@ -9,6 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase, GymEnv, ParallelEnv, StepCounter, TransformedEnv
 
+from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_environment, training_environment
 
 
@@ -36,7 +37,7 @@ def test_a_refusal_is_not_hidden_by_processes_that_never_began() -> None:
 @pytest.mark.parametrize(
     ("overrides", "functions"),
     [
-        (["compile=true"], ["CompiledGeometry._computed"]),
+        (["compile=true"], ["StepGeometry._all_published"]),
         (["compile=false"], []),
         # Without an anchor, and without constraints, nothing calls it.
         (["compile=true", "flow=squash"], []),
@@ -44,10 +45,7 @@ def test_a_refusal_is_not_hidden_by_processes_that_never_began() -> None:
     ],
 )
 def test_a_compiled_run_compiles_what_a_step_computes(
-    overrides: list[str],
-    functions: list[str],
-    make_config: Callable[..., DictConfig],
-    monkeypatch: pytest.MonkeyPatch,
+    overrides: list[str], functions: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = []
 
@@ -56,6 +54,6 @@ def test_a_compiled_run_compiles_what_a_step_computes(
         return function
 
     monkeypatch.setattr(torch, "compile", instead)
-    env = training_environment(make_config("env.agents=2", *overrides))
+    env = training_environment(compose_config("env.agents=2", *overrides))
     assert env.rollout(3)["next", "reward"].isfinite().all()
     assert compiled == functions

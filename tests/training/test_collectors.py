@@ -227,15 +227,20 @@ PATIENCE = 300
 """Seconds after which a process counts as one that stays."""
 
 
+STOPS = [(kind, signal.SIGINT) for kind in KINDS] + [(kind, signal.SIGTERM) for kind in KINDS[:2]]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_ctrl_c_stops_a_run_and_its_workers(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "number"), STOPS)
+def test_a_signal_to_all_processes_stops_a_run_when_it_is_saved(
+    kind: str, number: int, tmp_path: Path
+) -> None:
     if kind == "ray":
         pytest.importorskip("ray", reason="of the extra 'ray'")
     process, workers = begin(kind, tmp_path / "run")
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     _, told = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 128 + signal.SIGINT, told
+    assert process.returncode == 128 + number, told
     assert "stopped and saved at step" in told
     assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]
 

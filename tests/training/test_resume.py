@@ -3,7 +3,10 @@
 import os
 import resource
 import signal
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +18,12 @@ from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, TransformedEnv
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.checkpoints import CheckpointError, Checkpoints
 from cnfp_torchrl.training.environment_state import EpisodesBeginAnewWarning
-from cnfp_torchrl.training.interruption import STOP_SIGNALS, StopRequest, TrainingInterrupted
+from cnfp_torchrl.training.interruption import (
+    STOP_SIGNALS,
+    StopRequest,
+    TrainingInterrupted,
+    starting_workers,
+)
 from cnfp_torchrl.training.metrics import Metrics
 from cnfp_torchrl.training.resume import resumed_config
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
@@ -171,12 +179,30 @@ def test_a_signal_ends_the_evaluation_at_once(
     assert not differences(whole, folder.path)
 
 
-def test_a_second_signal_stops_at_once() -> None:
+def test_a_second_signal_stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with StopRequest() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.signal == signal.SIGTERM
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+    clock = iter([100.0, 100.5, 101.5])
+    monkeypatch.setattr(
+        "cnfp_torchrl.training.interruption.time", SimpleNamespace(monotonic=clock.__next__)
+    )
+    with StopRequest():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)  # the first once more, passed on by a sweep
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_workers_live_through_the_signals_that_stop_a_run() -> None:
+    blocked = "import signal; print(*map(int, signal.pthread_sigmask(signal.SIG_BLOCK, [])))"
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    with starting_workers():
+        told = subprocess.check_output([sys.executable, "-c", blocked], text=True)
+    assert set(STOP_SIGNALS) <= {int(number) for number in told.split()}
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
 
 
 def test_a_finished_run_can_be_extended(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """One step of learning: what it changes, that nothing waits for a GPU, and that it compiles."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.storage import prepare_buffer
 from cnfp_torchrl.training.train import train
 from cnfp_torchrl.training.update import Update
-from tests.host_reads import HostReads
+from tests.host_reads import HostReads, no_synchronization
 
 from .conftest import TINY
 
@@ -76,15 +75,6 @@ def test_reading_on_the_host_would_be_seen() -> None:
         _ = ones[ones > 0]
         torch.tensor([1.0])
     assert reads.count == 3
-
-
-@contextmanager
-def no_synchronization() -> Iterator[None]:
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        yield
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

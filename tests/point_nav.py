@@ -1,5 +1,7 @@
 """Point navigation in states where each constraint binds, and actors for it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -8,12 +10,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from cnfp_torchrl import Ball, Box, constrain_env
 from cnfp_torchrl.modules import ConstraintBijector, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-from cnfp_torchrl.training.networks import gaussian_network
+from cnfp_torchrl.training.networks import action_value_network, gaussian_network
 
 ORDER = ["battery", "obstacle"]
 
@@ -38,11 +40,22 @@ def make_env(batch_size: tuple[int, ...] = (len(STATES),), **options: int) -> Tr
     return constrain_env(base, ObstacleGeometry(), BatteryGeometry(), order=ORDER)
 
 
-def make_network() -> nn.Module:
-    """Return a network, which has the same weights each time."""
+@contextmanager
+def same_weights() -> Iterator[None]:
+    """Give networks that are made in this context the same weights each time."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return gaussian_network(5, 2, hidden=[8])
+        yield
+
+
+@same_weights()
+def make_network() -> nn.Module:
+    return gaussian_network(5, 2, hidden=[8])
+
+
+@same_weights()
+def make_critic() -> ValueOperator:
+    return action_value_network(5, 2, hidden=[8])
 
 
 def make_actor(network: nn.Module | None = None, **options: Any) -> Any:
