@@ -12,7 +12,7 @@ from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
-STEPS = 6
+STEPS = 4
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
 
 REFINEMENT = 5
@@ -127,7 +127,7 @@ def refined_attempt(
         The attempts in all states, side by side.
     """
     ascent = Ascent(sets, before.anchor, before.upper)
-    if not ascent.sees_all:
+    if not ascent.of.sees_all:
         return further_attempt(sets, depths, before, STEPS).select()
     largest = depths[0].amax(-1)
     for depth in depths[1:]:
@@ -147,15 +147,13 @@ def select_states(
 def _roomiest(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
-    """Choose the points with the most slack beyond the depth."""
+    """Choose the points with the most slack beyond the largest depth of each set."""
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
-    slacks = [s.row_slacks(stacked) for s in sets]
-    rooms = [(slack - depth).amin(-1) for slack, depth in zip(slacks, depths, strict=True)]
-    room, slack = (
-        torch.stack(torch.broadcast_tensors(*values)).amin(0)
-        for values in (rooms, [slack.amin(-1) for slack in slacks])
-    )
+    slacks = [s.slack(stacked) for s in sets]
+    room, slack = slacks[0] - depths[0].amax(-1), slacks[0]
+    for each, depth in zip(slacks[1:], depths[1:], strict=True):
+        room, slack = torch.minimum(room, each - depth.amax(-1)), torch.minimum(slack, each)
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
     # Not take_along_dim, with which an exported program would be one for a single batch size.
