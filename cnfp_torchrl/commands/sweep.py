@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -94,13 +95,20 @@ def report(folder: Path) -> str:
     return "\n\n".join([*parts, files])
 
 
-def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[str]:
+def resume(
+    folder: Path,
+    *,
+    jobs: int,
+    trusted: Sequence[str] = (),
+    states: Sequence[str] = ("failed", "stopped", "not started"),
+) -> Iterator[str]:
     """Go on with the runs that are neither done nor running; yield a line for each when it ends.
 
     Args:
         folder: The sweep's folder.
         jobs: The number of runs at a time, each in a process of its own.
         trusted: The names that their configurations may use, as ``trusted`` of ``cnfp-train``.
+        states: The states that runs are gone on from.
     """
 
     def go_on(run: SweepRun) -> str:
@@ -118,10 +126,13 @@ def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[
         )
         if done.returncode == 0:
             return f"{run.path}: done"
+        if done.returncode < 0 and run.path.is_dir():
+            name = signal.Signals(-done.returncode).name
+            RunFolder(run.path).save_failure(ChildProcessError(f"ended by {name}"))
         return f"{run.path}: {RunFolder(run.path).load_failure() or done.stderr.strip()}"
 
     runs = read_sweep(folder, planned_runs(folder))
-    unfinished = [run for run in runs if run.state not in ("done", "running")]
+    unfinished = [run for run in runs if run.state in states]
     with ThreadPoolExecutor(jobs) as pool:
         yield from pool.map(go_on, unfinished)
 

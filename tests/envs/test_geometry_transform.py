@@ -24,6 +24,7 @@ from cnfp_torchrl.geometry import (
 )
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from tests.host_reads import HostReads
+from tests.walls import Told
 
 STATES = 64
 
@@ -176,17 +177,6 @@ def test_names_and_keys_must_fit_the_environment() -> None:
 
 
 # A user's mistakes --------------------------------------------------------------------------------
-
-
-class Told(GeometryTransform):
-    """Returns, or raises, what a function of the state does."""
-
-    def __init__(self, answer: Callable[[TensorDictBase], Any]) -> None:
-        super().__init__("told")
-        self.answer = answer
-
-    def constraint_set(self, tensordict: TensorDictBase) -> Any:
-        return self.answer(tensordict)
 
 
 def raise_(error: Exception) -> None:

@@ -335,9 +335,7 @@ def test_copies_act_alike_and_share_nothing(
     assert flow_head(other).order == flow_head(actor).order
 
 
-def test_state_dict_round_trip_holds_the_network_and_nothing_else(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_state_dict_round_trip_holds_the_network_and_nothing_else(state: TensorDictBase) -> None:
     actor = make_actor()
     network = nn.Sequential(nn.Linear(5, 4), nn.ReLU())  # of another size
     other = copy.deepcopy(actor)
@@ -425,9 +423,7 @@ def test_nothing_else_changes_the_bounds(change: Callable[..., nn.Module]) -> No
     assert torch.equal(head.bounds.high, before.high)
 
 
-def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(env: TransformedEnv) -> None:
     def loss_of(spec: TensorSpec) -> SACLoss:
         network = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
         actor = make_constrained_actor(

@@ -131,30 +131,39 @@ class ObstacleGeometry(PointNavGeometry):
     """
 
     usual_name = "obstacle"
+    _half: Tensor
+    _signs: Tensor
+
+    def __init__(
+        self,
+        layout: Layout | None = None,
+        name: str | None = None,
+        observation_key: str = "observation",
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(layout, name, observation_key, **kwargs)
+        self.register_buffer("_half", torch.tensor(0.5), persistent=False)
+        self.register_buffer("_signs", torch.tensor([1.0, -1.0])[:, None, None], persistent=False)
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
         way = self.way(tensordict)
-        distance, last = way.side_distances, (None,) * way.found.ndim
+        distance = way.side_distances
         separates = way.separating.amax(1, keepdim=True) > 0
-        eligible = torch.where(separates, way.separating, distance)
-        eligible = eligible - self.path.precedence[:, *last]
-        chosen = eligible == eligible.amax(1, keepdim=True)
+        eligible = torch.where(separates, way.separating, distance) - self.path.precedence
+        left_out = eligible != eligible.amax(1, keepdim=True)
         # No room is left beside the chosen side of a rectangle that is touched.
         free = distance.masked_fill(distance.amax(1, keepdim=True) <= 0, -torch.inf)
-        # The last ones are the walls, all of which count.
-        room = torch.minimum(torch.where(chosen, free, torch.inf).amin(0), distance[-1])
-        high, low = ((room - MARGIN) / self.layout.step_length).movedim(0, -1).split(2, -1)
-        low = -low
-
-        outwards = torch.where(low + high >= 0, _BEYOND + 0.5, -_BEYOND - 0.5)
-        low, high = low.clamp(-1, 1), high.clamp(-1, 1)
-        beyond = low >= high
-        return Box(
-            torch.where(beyond, outwards - 0.5, low),
-            torch.where(beyond, outwards + 0.5, high),
-            validate_args=False,
-        )
+        # All sides of the arena count.
+        rooms = torch.cat([free.masked_fill(left_out, torch.inf), way.wall_distances])
+        # Of high bounds, then of low ones with their signs changed.
+        room = ((rooms.amin(0) - MARGIN) / self.layout.step_length).view(2, 2, -1)
+        bounds = room.clamp(-1, 1)
+        outwards = torch.where(room[:1] >= room[1:], _BEYOND + 0.5, -_BEYOND - 0.5)
+        outwards = torch.addcmul(self._half, self._signs, outwards)
+        bounds = torch.where(bounds.sum(0) <= 0, outwards, bounds)
+        high, low = bounds.mT.reshape(2, *way.batch, 2).unbind()
+        return Box(-low, high, validate_args=False)
 
 
 class VisibleObstacleGeometry(PointNavGeometry):
@@ -217,22 +226,24 @@ class BatteryGeometry(PointNavGeometry):
 
     def constraint_set(self, tensordict: TensorDictBase) -> Ball:
         """Return the ball of allowed moves (docs/method.md, section 4)."""
-        position, battery = self.read(tensordict)
-        way = self.way(tensordict)
-        steps_left = battery - (1 + self.layout.battery_threshold)
-        step, zone = CAUTIOUS * self.layout.step_length, CAUTIOUS * self.layout.zone_radius
-        reach = step * steps_left + zone
-        radius = torch.maximum(reach - way.rest, way.turning_radius) / self.layout.step_length
-        center = (way.waypoint - position) / self.layout.step_length
+        way, step = self.way(tensordict), self.layout.step_length
+        position = read_position(tensordict, self.in_keys[0])
+        battery = _read_charge(tensordict, self.in_keys[0]).reshape(-1)
+        rest, turning_radius = (way.beyond / step).unbind()
+        # What the battery allows after this step, in action units.
+        reach = CAUTIOUS * (battery - 1 - self.layout.battery_threshold)
+        reach = reach + CAUTIOUS * self.layout.zone_radius / step
+        radius = torch.maximum(reach - rest, turning_radius)
+        # At the waypoint itself any direction leads to it; squares of this one are in range.
+        center = (way.corner - position.reshape(-1, 2).mT) / step + 1e-18
 
-        lost = steps_left < 0
-        length = torch.linalg.vector_norm(center, dim=-1, keepdim=True)
-        ahead = torch.where(length > 0, center / length, torch.ones_like(center) / 2**0.5)
+        lost = battery <= self.layout.battery_threshold
         # Radius 1, and sqrt(2) to the corner of the action bounds: from 2 + 2 on they do not meet.
-        far = ahead * length.clamp(min=_BEYOND + 2)
+        length = center.square().sum(0).sqrt()
+        shares = (length / (_BEYOND + 2)).clamp(max=1).masked_fill(~lost, 1)
         return Ball(
-            torch.where(lost.unsqueeze(-1), far, center),
-            torch.where(lost, 1.0, radius),
+            (center / shares).mT.reshape(*way.batch, 2).contiguous(),
+            radius.masked_fill(lost, 1).view(way.batch),
             validate_args=False,
         )
 
@@ -252,9 +263,12 @@ class BatteryGeometry(PointNavGeometry):
 
 def read_observation(tensordict: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
     """Return positions ``(*batch, 2)`` and charges in whole percent, int64 ``(*batch,)``."""
-    position = read_position(tensordict, key)
-    battery = (tensordict.get(key)[..., 2] * BATTERY_FULL).round().to(torch.int64)
-    return position, battery
+    return read_position(tensordict, key), _read_charge(tensordict, key).to(torch.int64)
+
+
+def _read_charge(tensordict: TensorDictBase, key: str) -> Tensor:
+    """Return charges in whole percent, ``(*batch,)``."""
+    return (tensordict.get(key)[..., 2] * BATTERY_FULL).round()
 
 
 def read_position(tensordict: TensorDictBase, key: str) -> Tensor:

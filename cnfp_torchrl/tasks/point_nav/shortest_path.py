@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import embedding
 
 from cnfp_torchrl.tasks.point_nav.layout import Layout
 
@@ -32,25 +31,45 @@ _TOLERANCE = 1e-9
 
 
 class StationWay(NamedTuple):
-    """The way from a position to the station that is nearest along it."""
+    """The way from a position to the station that is nearest along it.
 
-    waypoint: Tensor
-    """The next point to go to straight, ``(*batch, 2)``: a node of the grid or the station."""
-    rest: Tensor
-    """What remains beyond the waypoint, its turn included; 0 at a station; ``(*batch,)``."""
-    turning_radius: Tensor
-    """The distance from the waypoint within which all is visible that is visible from it; 0 at a
-    station; ``(*batch,)``."""
+    Batches come last in all fields, flattened: over first dimensions reductions are fastest.
+    """
+
+    corner: Tensor
+    """The next point to go to straight, ``(2, B)``: a node of the grid or the station."""
+    beyond: Tensor
+    """What remains beyond the waypoint, its turn included, 0 at a station; and the distance from
+    the waypoint within which all is visible that is visible from it, 0 at a station; ``(2, B)``."""
     side_distances: Tensor
     """The distances to the prolonged sides (x_low, y_low, x_high, y_high) of each rectangle,
-    positive outside, and of all beyond the walls, positive inside, ``(R + 1, 4, *batch)``: over
-    first dimensions reductions are fastest."""
+    positive outside, ``(R, 4, B)``."""
+    wall_distances: Tensor
+    """The same of all beyond the walls, positive inside, ``(1, 4, B)``."""
     separating: Tensor
-    """The same for sides that the waypoint lies beyond, -inf for others and where no way was found:
-    positive where a side separates its rectangle from both the position and the waypoint."""
-    found: Tensor
-    """False inside rectangles and where no separable way exists, bool ``(*batch,)``; the waypoint
-    is then the station nearest in a straight line."""
+    """The distances to sides that the waypoint lies beyond, -inf for others and where no way was
+    found, ``(R, 4, B)``: positive where a side separates its rectangle from both the position and
+    the waypoint."""
+    lost: Tensor
+    """True inside rectangles and where no separable way exists, bool ``(B,)``; the waypoint is then
+    the station nearest in a straight line."""
+    batch: torch.Size
+    """The batch size of the positions."""
+
+    @property
+    def waypoint(self) -> Tensor:
+        """The next point to go to straight, ``(*batch, 2)``."""
+        return self.corner.mT.reshape(*self.batch, 2)
+
+    @property
+    def rest(self) -> Tensor:
+        """What remains beyond the waypoint, ``(*batch,)``."""
+        return self.beyond[0].view(self.batch)
+
+    @property
+    def found(self) -> Tensor:
+        """Whether a separable way exists, bool ``(*batch,)``."""
+        return ~self.lost.view(self.batch)
 
 
 class ShortestPath(nn.Module):
@@ -72,11 +91,13 @@ class ShortestPath(nn.Module):
 
     rectangles: Tensor
     sides: Tensor
+    outwards: Tensor
     side_codes: Tensor
     precedence: Tensor
     first_rows: Tensor
     node_x: Tensor
     node_y: Tensor
+    numbers: Tensor
     node_lengths: Tensor
     node_table: Tensor
     far: Tensor
@@ -95,24 +116,40 @@ class ShortestPath(nn.Module):
 
     def to_station(self, position: Tensor) -> StationWay:
         """Return the way to the nearest station from positions ``(*batch, 2)``."""
-        x, y = position.unbind(-1)
-        last = (None,) * x.ndim
-        distances = torch.stack([-x, -y, x, y]) + self.sides[..., *last]
+        at = position.reshape(-1, 2).mT.contiguous()
+        distances = (self.sides + self.outwards * at).flatten(1, 2)
+        node, lost = self._nearest_node(at, distances)
+        corner, beyond, clear = self.node_table.index_select(1, node).tensor_split((2, 4))
+        side_distances, wall_distances = distances.tensor_split((len(self.rectangles),))
+        separating = side_distances + clear.view_as(side_distances)
+        separating = separating.masked_fill(lost, -torch.inf)
+        return StationWay(
+            corner, beyond, side_distances, wall_distances, separating, lost, position.shape[:-1]
+        )
+
+    @torch.no_grad()
+    def _nearest_node(self, at: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the numbers of the nodes to go to, and where none is seen, both ``(B,)``."""
         # The sides that a rectangle is seen from tell which nodes are separable from it: looked up,
         # not compared side by side with each node.
-        seen_from = ((distances > 0) * self.side_codes[:, *last]).sum(1, dtype=torch.int32)
-        lengths = embedding(seen_from + self.first_rows[:, *last], self.node_lengths).amax(0)
-        # Not `torch.hypot`, which takes as long as all of this at large batches.
-        along_x, along_y = x.unsqueeze(-1) - self.node_x, y.unsqueeze(-1) - self.node_y
-        distance = torch.addcmul(along_x.square(), along_y, along_y).sqrt()
-        shortest, node = (distance + lengths).min(-1)
-        found = shortest < self.far
-        known = embedding(node, self.node_table)
-        clear = known[..., 4:].movedim(-1, 0).view_as(distances)
-        separating = torch.where(found, distances + clear, -torch.inf)
-        return StationWay(
-            known[..., :2], known[..., 2], known[..., 3], distances, separating, found
-        )
+        rows = ((distances[: len(self.first_rows)] > 0) * self.side_codes).sum(1)
+        if len(rows) == 1:
+            lengths = self.node_lengths.index_select(1, rows[0])
+        else:
+            rows = rows + self.first_rows
+            lengths = self.node_lengths.index_select(1, rows.flatten())
+            lengths = lengths.unflatten(1, rows.shape).amax(1)
+        # In place, as most of the time of large batches is that of memory. Not `torch.hypot`, which
+        # takes as long as all of this.
+        along = at[1] - self.node_y
+        distance = (at[0] - self.node_x).square_().addcmul_(along, along).sqrt_()
+        lengths = lengths.add_(distance)
+        shortest = lengths.amin(0)
+        # Not `min` with its index, nor `argmin`, which take some times as long: the least number of
+        # nodes that are no farther, as any difference between two lengths exceeds 1e-20.
+        node = lengths.sub_(shortest).mul_(1e30).add_(self.numbers).amin(0)
+        # 0 for positions that are not finite.
+        return node.nan_to_num_(0, 0).int(), shortest >= self.far
 
     def to_goal(self, position: Tensor, goal: Tensor) -> Tensor:
         """Return the next waypoint on the shortest way to a goal, ``(*batch, 2)``.
@@ -170,30 +207,32 @@ class ShortestPath(nn.Module):
             shorter := torch.minimum(rest, (lengths + rest).amin(-1) + turn), rest
         ):
             rest = shorter
-        # Sixteen rows for each rectangle: one for each combination of sides that it is seen from.
-        # A station behind one is farther than anything else, so that the nearest of them is gone to
-        # if all are hidden. The arena hides nothing; its rows are the lengths from a node onwards.
+        # The lengths from each node onwards, in sixteen columns for each rectangle: one for each
+        # combination of sides that it is seen from. A station behind one is farther than anything
+        # else, so that the nearest of them is gone to if all are hidden. The arena hides nothing.
         far = 10 * (layout.wall + rest[rest.isfinite()].amax())
         side_codes = 2 ** torch.arange(4)
         seen_from = (torch.arange(16).unsqueeze(-1) & side_codes) > 0
         separable = (seen_from.unsqueeze(1) & clear.movedim(0, 1).unsqueeze(1)).any(-1)
         hidden = torch.where(separable, zero, torch.where(is_station, far, torch.inf))
-        lengths = torch.cat([hidden.flatten(0, 1), rest.expand(16, -1)])
+        lengths = hidden.flatten(0, 1) + rest if len(rectangles) else rest.expand(16, -1)
         beyond_walls = torch.full((1, 4), layout.wall, dtype=torch.float64)
         sides = torch.cat([rectangles * torch.tensor([1, 1, -1, -1]), beyond_walls])
-        clear = torch.cat([clear, clear.new_ones(len(nodes), 1, 4)], 1).flatten(1)
-        known = [nodes, rest.unsqueeze(-1), turning_radius.unsqueeze(-1)]
+        clear = torch.where(clear, 0.0, -torch.inf).double().flatten(1)
+        known = torch.cat([nodes, torch.stack([rest, turning_radius], -1), clear], 1)
         return [
             ("rectangles", rectangles),
-            ("sides", sides),
-            ("side_codes", side_codes.int()),
+            ("sides", sides.view(-1, 2, 2, 1)),
+            ("outwards", torch.tensor([-1.0, 1.0])[:, None, None]),
+            ("side_codes", side_codes.int().unsqueeze(-1)),
             # By which one of sides that are equally far is preferred.
-            ("precedence", 1e-6 * layout.wall * torch.arange(4.0)),
-            ("first_rows", 16 * torch.arange(len(sides), dtype=torch.int32)),
-            ("node_x", nodes[:, 0]),
-            ("node_y", nodes[:, 1]),
-            ("node_lengths", lengths),
-            ("node_table", torch.cat([*known, torch.where(clear, 0.0, -torch.inf).double()], 1)),
+            ("precedence", 1e-6 * layout.wall * torch.arange(4.0).unsqueeze(-1)),
+            ("first_rows", 16 * torch.arange(max(len(rectangles), 1)).unsqueeze(-1)),
+            ("node_x", nodes[:, :1]),
+            ("node_y", nodes[:, 1:]),
+            ("numbers", torch.arange(float(len(nodes))).unsqueeze(-1)),
+            ("node_lengths", lengths.mT.contiguous()),
+            ("node_table", known.mT.contiguous()),
             ("far", far),
         ]
 

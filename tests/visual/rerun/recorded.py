@@ -1,7 +1,8 @@
 """Recordings of made-up steps, and their content read back."""
 
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from tests.visual.cases import make_actor, make_state
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
-def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
-    """Write a recording to a file and close it."""
+@contextmanager
+def recorded(path: Path) -> Iterator[rr.RecordingStream]:
+    """Record into a file, which is closed at the end."""
     # In portions of a given size: by the clock, a busy machine would cut elsewhere.
     portions = rr.ChunkBatcherConfig.NEVER()
     portions.flush_num_bytes = 1 << 16
@@ -29,10 +31,9 @@ def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
         "tests", recording_id="tests", send_properties=False, batcher_config=portions
     )
     stream.save(path)
-    write(stream)
+    yield stream
     stream.flush(timeout_sec=10)
     stream.disconnect()
-    return path
 
 
 def record_steps(
@@ -54,13 +55,11 @@ def record_steps(
         taken.append(transition)
     assert flow_head(actor).order == list(sets)
 
-    def write(stream: rr.RecordingStream) -> None:
+    with recorded(path) as stream:
         stream.send_blueprint(flow_blueprint(actor, projections=projections))
         flow_stream = FlowStream(stream, actor, projections=projections, samples=64)
         for step, transition in enumerate(taken):
             flow_stream.log_step(step, transition)
-
-    record(path, write)
     return taken
 
 
