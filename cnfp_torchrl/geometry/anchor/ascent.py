@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry.anchor.inequalities import Derivatives, Inequalities, chosen
+from cnfp_torchrl.geometry.anchor.inequalities import Derivatives, Inequalities, Slacks, chosen
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 START = 0.1
@@ -79,9 +79,9 @@ class Ascent:
     def run(self, steps: int) -> None:
         """Take some steps, and improve the bounds with each of them."""
         for _ in range(steps):
-            at, slack = self._evaluate()
-            self._step(at, slack >= ENOUGH * self.upper)
-        self._evaluate()
+            slacks = self.of.slacks(self.x)
+            self._step(self._evaluate(slacks), slacks.least >= ENOUGH * self.upper)
+        self._evaluate(self.of.slacks(self.x))
 
     def run_until(self, steps: int, share: float, depth: Tensor) -> tuple[Tensor, ...]:
         """Take steps until all points are deep enough or cannot be, and tell which are.
@@ -96,12 +96,19 @@ class Ascent:
             enough, ``(B,)`` each, side by side.
         """
         least, left = self.of.batch_last(depth, 0), None
+        done = torch.zeros_like(least, dtype=torch.bool)
         anchor = upper = decided = self.x
-        for step in range(steps + 1):
-            at, slack = self._evaluate()
-            deep = slack >= torch.maximum(least, share * self.upper)
+        slacks, at = self.of.slacks(self.x), None
+        # Before the first step twice: the sets' own ranges alone decide many states.
+        for check in range(steps + 2):
+            if at is not None:
+                self._step(at, done)
+                slacks = self.of.slacks(self.x)
+            if check:
+                at = self._evaluate(slacks)
+            deep = slacks.least >= torch.maximum(least, share * self.upper)
             done = deep | (self.upper < -least)
-            count = len(done) - int(done.sum()) if step < steps else 0
+            count = len(done) - int(done.sum()) if check <= steps else 0
             if 2 * count <= len(done):
                 here = self.of.action(self.x).mT
                 if left is None:
@@ -116,23 +123,20 @@ class Ascent:
                 keep = (~done).nonzero().squeeze(-1)
                 left = keep if left is None else left[keep]
                 least, done = chosen(least, keep), done[keep]
-                at = self._select(keep, at)
-            self._step(at, done)
+                self._select(keep)
+                slacks, at = slacks.select(keep), at and at.select(keep)
         return anchor, upper, decided
 
-    def _select(self, keep: Tensor, at: Derivatives) -> Derivatives:
-        """Go on with some of the points, and return their derivatives."""
+    def _select(self, keep: Tensor) -> None:
+        """Go on with some of the points."""
         self.of.select(keep)
         for name in ("x", "upper", "tiny", "weights", "level", "mean"):
-            setattr(self, name, chosen(getattr(self, name), keep))
-        room, gradient, *others = at
-        some = ([chosen(value, keep) for value in values] for values in others)
-        return Derivatives(chosen(room, keep), chosen(gradient, keep), *some)
+            if (value := getattr(self, name)) is not None:
+                setattr(self, name, chosen(value, keep))
 
-    def _evaluate(self) -> tuple[Derivatives, Tensor]:
-        """Return derivatives and the smallest slack at the points, and improve the bounds."""
+    def _evaluate(self, slacks: Slacks) -> Derivatives:
+        """Return derivatives at the points, and improve the bounds."""
         of, x = self.of, self.x
-        slacks = of.slacks(x)
         begins, least = self.weights is None, slacks.least
         if begins:
             self.mean = torch.add(self.tiny, (self.upper - least).relu(), alpha=START)
@@ -156,7 +160,7 @@ class Ascent:
         for place, gain in enumerate(at.gains, len(at.room) - len(at.gains)):
             most = torch.addcmul(most, self.weights[place], gain)
         self.upper = torch.fmin(self.upper, self.level + most / total)
-        return at, least
+        return at
 
     def _step(self, at: Derivatives, stays: Tensor) -> None:
         """Take a Newton step, shortened, from all points but those that stay."""

@@ -54,6 +54,11 @@ class Slacks(NamedTuple):
     images: list[Tensor]
     lengths: list[Tensor]
 
+    def select(self, keep: Tensor) -> Slacks:
+        """Return some batch elements."""
+        images, lengths = ([chosen(v, keep) for v in values] for values in self[2:])
+        return Slacks(chosen(self.value, keep), chosen(self.least, keep), images, lengths)
+
 
 class Derivatives(NamedTuple):
     """Inequalities at points and levels, and their derivatives in both.
@@ -73,6 +78,11 @@ class Derivatives(NamedTuple):
     heights: list[Tensor]
     curvatures: list[Tensor]
     gains: list[Tensor]
+
+    def select(self, keep: Tensor) -> Derivatives:
+        """Return some batch elements."""
+        others = ([chosen(value, keep) for value in values] for values in self[2:])
+        return Derivatives(chosen(self.room, keep), chosen(self.gradient, keep), *others)
 
 
 class Inequalities:
