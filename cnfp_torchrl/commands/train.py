@@ -115,6 +115,10 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
     overrides = hydra_config.overrides.task
     # Slurm starts a job that was preempted, or ran out of time, once more and in the same way.
     if int(os.environ.get("SLURM_RESTART_COUNT", "0")) and RunFolder(output).has_started:
+        folder = RunFolder.resume(output)
+        if OmegaConf.to_container(config, resolve=True) == folder.load_settings():
+            return folder, config  # of this very command, whose own packages need no trust
+        folder.close()
         resumed, overrides = output, []
     if resumed is not None:
         folder = RunFolder.resume(resumed)
