@@ -88,6 +88,9 @@ def test_anchors_are_timed_and_tabulated(tmp_path: Path) -> None:
         assert {"exact flow", "anchors, 1 % relaxed", "anchors, 10 % relaxed"} < set(rows)
         assert rows["exact flow"]["ratio"] == 1
         assert all(0 < row["low"] <= row["ratio"] <= row["high"] for row in rows.values())
+    aims = text[text.index("## Aims, met and missed") :].splitlines()[4:]
+    assert len(aims) == 3
+    assert all(line.endswith("| met |") or "| missed by " in line for line in aims)
 
 
 def test_each_line_is_measured_alone_and_tabulated(tmp_path: Path) -> None:

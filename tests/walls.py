@@ -1,6 +1,6 @@
 """An environment whose constraint can be had in some states, and cannot in others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -98,6 +98,19 @@ class Window(Wall):
         # Before the rectangle, or in it: there nothing is visible.
         position = torch.where(limit > 0, -5.0, 0.0).unsqueeze(-1).expand(*limit.shape, 2)
         return VisibleRegion(position, hidden, torch.ones_like(limit))
+
+
+class Told(GeometryTransform):
+    """The sets that a function of the state returns."""
+
+    def __init__(
+        self, publish: Callable[[TensorDictBase], Any], name: str = "told", **options: Any
+    ) -> None:
+        super().__init__(name, **options)
+        self.answer = publish
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Any:
+        return self.answer(tensordict)
 
 
 def walls(base: EnvBase, *geometries: GeometryTransform) -> TransformedEnv:

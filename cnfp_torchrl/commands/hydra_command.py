@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -18,12 +19,16 @@ from omegaconf import DictConfig
 
 from cnfp_torchrl.commands.paths import quoted_paths
 from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, errors_in_a_sentence, write_error
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.commands.side_by_side import begin_no_other, begin_run, is_side_by_side
+from cnfp_torchrl.configuration import config_directory, refuse_unknown_settings
+from cnfp_torchrl.training.interruption import TrainingInterrupted
 
 R = TypeVar("R")
 
 
-def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[], None]]:
+def hydra_command(
+    name: str, after_death: Callable[[], None] | None = None
+) -> Callable[[Callable[[DictConfig], R]], Callable[[], None]]:
     """Return a decorator that makes a command of a function of a configuration.
 
     The command takes ``run=PATH`` and ``resume=PATH`` with any path. Where it fails, the cause
@@ -31,6 +36,7 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[
 
     Args:
         name: The configuration's name in ``conf/``.
+        after_death: What goes on with a sweep of which a process has died, in place of an error.
     """
 
     def decorate(function: Callable[[DictConfig], R]) -> Callable[[], None]:
@@ -40,6 +46,7 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[
                 return _run_of_sweep(function, config)
             # Not left to Hydra, which prints the overrides before the cause.
             with errors_in_a_sentence():
+                refuse_unknown_settings(config)
                 return function(config)
 
         application = hydra.main(
@@ -50,7 +57,12 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[
         def command() -> None:
             sys.argv[1:] = quoted_paths(sys.argv[1:])
             with errors_in_a_sentence(), _raised_by_hydra():
-                application()
+                try:
+                    application()
+                except BrokenProcessPool:
+                    if after_death is None:
+                        raise
+                    after_death()
 
         return command
 
@@ -64,8 +76,17 @@ def is_sweep() -> bool:
 
 def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
     """Call a function, and write at once why it fails: Hydra tells of one failure, at the end."""
+    is_in_worker = is_side_by_side(HydraConfig.get())
     try:
+        if is_in_worker:
+            begin_run()
+        refuse_unknown_settings(config)
         return function(config)
+    except (SystemExit, TrainingInterrupted) as stop:
+        if not is_in_worker:
+            raise
+        # As a failure, for joblib would kill the others.
+        raise CompactHydraException(str(begin_no_other(stop))) from stop
     except Exception as error:
         folder = Path(HydraConfig.get().runtime.output_dir).name
         # Not the end of the process, which would be that of the sweep.

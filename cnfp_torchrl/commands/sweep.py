@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from cnfp_torchrl.commands.extras import needs_extra
+from cnfp_torchrl.commands.trusted import TRUSTED
 
 with needs_extra("train"):
     from cnfp_torchrl.commands.paths import quoted
@@ -94,13 +96,20 @@ def report(folder: Path) -> str:
     return "\n\n".join([*parts, files])
 
 
-def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[str]:
+def resume(
+    folder: Path,
+    *,
+    jobs: int,
+    trusted: Sequence[str] = (),
+    states: Sequence[str] = ("failed", "stopped", "not started"),
+) -> Iterator[str]:
     """Go on with the runs that are neither done nor running; yield a line for each when it ends.
 
     Args:
         folder: The sweep's folder.
         jobs: The number of runs at a time, each in a process of its own.
         trusted: The names that their configurations may use, as ``trusted`` of ``cnfp-train``.
+        states: The states that runs are gone on from.
     """
 
     def go_on(run: SweepRun) -> str:
@@ -118,10 +127,13 @@ def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[
         )
         if done.returncode == 0:
             return f"{run.path}: done"
+        if done.returncode < 0 and run.path.is_dir():
+            name = signal.Signals(-done.returncode).name
+            RunFolder(run.path).save_failure(ChildProcessError(f"ended by {name}"))
         return f"{run.path}: {RunFolder(run.path).load_failure() or done.stderr.strip()}"
 
     runs = read_sweep(folder, planned_runs(folder))
-    unfinished = [run for run in runs if run.state not in ("done", "running")]
+    unfinished = [run for run in runs if run.state in states]
     with ThreadPoolExecutor(jobs) as pool:
         yield from pool.map(go_on, unfinished)
 
@@ -129,14 +141,13 @@ def resume(folder: Path, *, jobs: int, trusted: Sequence[str] = ()) -> Iterator[
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print and write the table of a sweep, and go on with what is not done if asked to."""
     parser = argparse.ArgumentParser(
-        prog="cnfp-sweep", description="Tell what came of a sweep of cnfp-train -m."
+        prog="cnfp-sweep",
+        description="Tell what came of a sweep of cnfp-train -m.",
+        parents=[TRUSTED],
     )
     parser.add_argument("folder", type=Path, help="the sweep's folder, multirun/DATE/TIME")
     parser.add_argument("--resume", action="store_true", help="go on with runs that are not done")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time (1)")
-    parser.add_argument(
-        "--trusted", action="append", default=[], metavar="NAME", help="see cnfp-train's trusted"
-    )
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"--jobs: expected a number >= 1, given {options.jobs}")

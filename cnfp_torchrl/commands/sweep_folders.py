@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from itertools import product
@@ -14,6 +15,8 @@ from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+
+from cnfp_torchrl.commands.side_by_side import is_side_by_side, stop_when_runs_are_saved
 
 LONGEST = 80
 """Characters of a folder's name; the number before it keeps names apart that are cut."""
@@ -34,6 +37,8 @@ class SweepStart(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remember the folder."""
         STARTED.append(Path(str(config.hydra.sweep.dir)).absolute())
+        if is_side_by_side(config.hydra):
+            stop_when_runs_are_saved(STARTED[-1])
 
 
 def run_name(number: int, overrides: Sequence[str], constant: Sequence[str]) -> str:
@@ -95,6 +100,14 @@ def planned_runs(folder: Path) -> dict[Path, list[str]]:
     return {
         folder / run_name(i, overrides, constant): overrides for i, overrides in enumerate(runs)
     }
+
+
+def processes(folder: Path) -> int:
+    """Return how many runs of a sweep that Hydra has started go side by side."""
+    settings = yaml.safe_load((folder / MULTIRUN).read_text(encoding="utf-8"))["hydra"]
+    given = int(settings["launcher"].get("n_jobs", 1))
+    # As joblib counts: -1 is one for each processor.
+    return given if given > 0 else max((os.cpu_count() or 1) + 1 + given, 1)
 
 
 def config_arguments(folder: Path) -> list[str]:

@@ -20,14 +20,21 @@ with needs_extra("train"):
 
     from cnfp_torchrl.commands.hydra_command import hydra_command, is_sweep
     from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, write_error
-    from cnfp_torchrl.commands.sweep import report
-    from cnfp_torchrl.commands.sweep_folders import STARTED, with_common_keys
+    from cnfp_torchrl.commands.side_by_side import obey_signals, wait_for_workers
+    from cnfp_torchrl.commands.sweep import report, resume
+    from cnfp_torchrl.commands.sweep_folders import (
+        STARTED,
+        planned_runs,
+        processes,
+        with_common_keys,
+    )
     from cnfp_torchrl.configuration import foreign_packages
     from cnfp_torchrl.training.callbacks import RECORDING
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
     from cnfp_torchrl.training.resume import resumed_config
     from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.sweep import read_sweep
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
 
@@ -116,7 +123,30 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
     return folder, config
 
 
-@hydra_command("train")
+def _go_on_after_death() -> None:
+    """Go on with the runs that a sweep lost with one of its processes, each in one of its own."""
+    wait_for_workers()
+    obey_signals()
+    are_done = True
+    for sweep in STARTED:
+        sys.stderr.write(
+            f"{sweep}: a process was killed, which often means that the memory was full, and with "
+            "it those beside it; their runs go on from what they have saved, each in a process of "
+            "its own\n"
+        )
+        # What this very command has begun is trusted.
+        lost = ("stopped", "not started")
+        for line in resume(sweep, jobs=processes(sweep), trusted=[""], states=lost):
+            sys.stderr.write(f"{line}\n")
+        planned = planned_runs(sweep)
+        if not planned:
+            sys.stderr.write(f"{sweep}: the runs that it was yet to have are not known\n")
+        are_done &= bool(planned) and all(run.is_done for run in read_sweep(sweep, planned))
+    if not are_done:
+        sys.exit(1)
+
+
+@hydra_command("train", _go_on_after_death)
 def _main(config: DictConfig) -> float:
     """Train, draw the run's figures, print the summary, and return what a sweep maximizes."""
     folder, config = _folder_and_config(config)
@@ -161,6 +191,9 @@ def main() -> None:
     sys.argv[1:] = with_common_keys(sys.argv[1:])
     try:
         _main()
+    except TrainingInterrupted as stop:
+        sys.stderr.write(f"{stop}\n")
+        sys.exit(128 + stop.number)
     finally:
         # Also after a run that failed, which is why the others are worth a look.
         for sweep in STARTED:

@@ -25,7 +25,7 @@ from cnfp_torchrl.modules import (
     refuse_misfit,
 )
 
-STEPS = 6
+STEPS = 4
 """The number of steps inwards of the search for an anchor, as in `attempt_anchor`."""
 
 

@@ -81,8 +81,9 @@ class KinkedSumBound(ConstraintSet):
     def bounding_box(self) -> Bounds:
         upper, lower = self.slopes(self.weights)
         bound = self.bound.unsqueeze(-1)
-        # A slope of zero leaves its side free: abs() turns -0 into 0, whose low bound is -inf.
-        return Bounds(-bound / lower.abs(), bound / upper)
+        # A slope of zero leaves its side free, also one of -0 and beside a bound of 0.
+        low, high = ((bound / s.abs()).masked_fill(s == 0, torch.inf) for s in (lower, upper))
+        return Bounds(-low, high)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # The sum is at most |center|_1 at the center, and grows at most by one each unit.

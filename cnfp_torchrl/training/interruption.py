@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -54,6 +55,9 @@ class TrainingInterrupted(BaseException):
 class StopRequest:
     """Remembers SIGTERM and Ctrl-C while it is entered; a second one ends the program at once.
 
+    The same one within a second is no second one: a sweep passes on what a terminal or Slurm may
+    have told its runs already.
+
     Outside of the main thread, where Python takes no signals, nothing is changed.
 
     Args:
@@ -64,6 +68,7 @@ class StopRequest:
         self._signals = signals
         self.signal: int | None = None
         """The number of the signal that came, or None."""
+        self._came = 0.0
         self._last_words: str | None = None
         self._previous: dict[int, Any] = {}
 
@@ -102,8 +107,11 @@ class StopRequest:
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if self._last_words is not None:
             raise TrainingInterrupted(number, self._last_words)
+        now = time.monotonic()
+        if self.signal == number and now - self._came < 1:
+            return
         if self.signal is not None:
             raise KeyboardInterrupt
-        self.signal = number
+        self.signal, self._came = number, now
         name = signal.Signals(number).name
         sys.stderr.write(f"\n{name}: the run stops after this step and saves; again: at once\n")

@@ -35,6 +35,12 @@ SCIPY = Path(__file__).with_name("anchors.json")
 TIGHT = 0.05
 """The share of the states of facing rows whose best slack is some thousandths."""
 
+NO_RELAXATION = ("anchors, easy", "anchors, 30 % tight", "anchors, 5 % tight")
+"""The kinds of states in which all sets can hold: at most twice the flow's time is aimed at."""
+
+MILLISECONDS = {16: 1.0, 4096: 4.0}
+"""What is aimed at where all sets can hold, for batches of sets that lie apart."""
+
 APART = [(16, 2, 2), (256, 2, 2), (4096, 2, 2), (256, 6, 2)]
 """Batch, dimension and number of constraints of sets that lie apart."""
 
@@ -188,7 +194,34 @@ def main() -> None:
         + "; ".join(f"{key}: {value}" for key, value in agreement)
         + ".",
     )
-    sys.stdout.write((arguments.out / "anchors.md").read_text())
+    page = arguments.out / "anchors.md"
+    page.write_text("\n".join([page.read_text().rstrip("\n"), "", *judged(results), ""]))
+    sys.stdout.write(page.read_text())
+
+
+def judged(results: dict[str, Rows]) -> list[str]:
+    """Return a table of what was aimed at, what was measured, and what was missed by how much."""
+    projection = next((rows["qpax"]["ms"] for rows in results.values() if "qpax" in rows), None)
+    lines = ["## Aims, met and missed", "", "| what | measured | aim | |", "|---|---|---|---|"]
+
+    def add(what: str, value: float, aim: float, unit: str) -> None:
+        verdict = "met" if value <= aim else f"missed by {value / aim - 1:.0%}"
+        lines.append(f"| {what} | {value:.2f} {unit} | {aim:.2f} {unit} | {verdict} |")
+
+    for title, rows in results.items():
+        for name, row in rows.items():
+            what = f"{title}: {name}"
+            if title.endswith("beside qpax"):
+                if name != "qpax":
+                    add(what, row["ratio"], 1.0, "of qpax's time")
+            elif name in NO_RELAXATION:
+                add(what, row["ratio"], 2.0, "of the flow's time")
+            elif "apart" in title and "d = 6" in title and "relaxed" in name and projection:
+                add(what, row["ms"], projection, "ms, as qpax for rows alone")
+            for batch, most in MILLISECONDS.items():
+                if title.startswith(f"sets apart, batch {batch},") and name in NO_RELAXATION:
+                    add(what, row["ms"], most, "ms")
+    return lines
 
 
 def _load() -> str:

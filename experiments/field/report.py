@@ -50,7 +50,7 @@ class Label(NamedTuple):
 LABELS = {
     "hard": Label("exact flow, hard retraction", "#0072B2"),
     "soft": Label("exact flow, soft retraction", "#D55E00"),
-    "sharp": Label("the same, sharpness 4", "#E69F00"),
+    "sharp": Label("exact flow, soft retraction of sharpness 4", "#E69F00"),
     "projection": Label("projection in the policy", "#009E73"),
     "sb3_projection": Label("Stable-Baselines3, projection in the environment", "#CC79A7"),
     "unconstrained": Label("unconstrained", "#5A5A5A"),

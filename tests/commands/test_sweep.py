@@ -1,13 +1,19 @@
 """Real sweeps, in processes of their own."""
 
 import csv
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from cnfp_torchrl.commands.sweep import main as sweep_command
-from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
+from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
 from tests.entry_points import run_command
 
 TINY = [
@@ -80,6 +86,58 @@ def test_launchers_give_the_runs_that_one_after_another_gives(
     assert done.returncode == 0, done.stderr
     assert results(tmp_path / "s") == results(basic)
     assert [row["state"] for row in table(basic)] == ["done"] * 3
+
+
+def begin_side_by_side(sweep: Path, *settings: str) -> subprocess.Popen[str]:
+    """Begin a sweep of two processes; return when its first two runs have saved a state."""
+    arguments = ["-m", *TINY, *settings, f"hydra.sweep.dir={sweep}", "hydra/launcher=parallel"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while len({path.parent for path in sweep.glob(f"*/{STATES}/state-*")}) < 2:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    return process
+
+
+def works_in(folder: Path, process: psutil.Process) -> bool:
+    """Tell whether a process holds a run's folder."""
+    files = Path(f"/proc/{process.pid}/fd").iterdir()
+    return any(file.resolve() == folder.resolve() for file in files)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are told apart by /proc")
+def test_a_killed_process_takes_no_run_with_it(tmp_path: Path) -> None:
+    sweep = tmp_path / "s"
+    longer = ["collector.total_frames=960", "checkpoint.interval=48", "hydra.launcher.n_jobs=2"]
+    process = begin_side_by_side(sweep, *longer, "seed=0,1,2")
+    workers = psutil.Process(process.pid).children()
+    (killed,) = (each for each in workers if works_in(sweep / "0_seed-0", each))
+    killed.kill()
+    _, told = process.communicate()
+    assert process.returncode == 0, told
+    assert "a process was killed" in told
+    assert [row["state"] for row in table(sweep)] == ["done"] * 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_runs_side_by_side_when_they_are_saved(number: int, tmp_path: Path) -> None:
+    sweep = tmp_path / "s"
+    endless = ["collector.total_frames=1000000", "checkpoint.interval=48"]
+    process = begin_side_by_side(sweep, *endless, "hydra.launcher.n_jobs=2", "seed=0,1,2")
+    os.killpg(process.pid, number)
+    _, told = process.communicate()
+    assert process.returncode == 128 + number, told
+    assert told.count("stopped and saved at step") == 2
+    states = [row["state"] for row in table(sweep)]
+    assert [state.partition(":")[0] for state in states] == ["stopped", "stopped", "not started"]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cnfp_torchrl.envs import GeometryTransform, constrain_env
+from cnfp_torchrl.envs import constrain_env
 from cnfp_torchrl.geometry import (
     Ball,
     Box,
@@ -22,18 +22,10 @@ from cnfp_torchrl.geometry import (
 )
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
+from tests.walls import Told
 
 DIM, STATES = 2, 8
 Publish = Callable[[TensorDictBase], ConstraintSet]
-
-
-class Told(GeometryTransform):
-    def __init__(self, publish: Publish, **options: object) -> None:
-        super().__init__("told", **options)
-        self.publish = publish
-
-    def constraint_set(self, tensordict: TensorDictBase) -> ConstraintSet:
-        return self.publish(tensordict)
 
 
 def zeros(state: TensorDictBase) -> Tensor:

@@ -1,21 +1,14 @@
-"""Running the examples as a user does, and spies that watch them."""
+"""A place of their own for the examples, and what watches them."""
 
-import importlib.util
-import runpy
-import sys
-from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
 from hydra.core.config_store import ConfigStore
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
-
-Run = Callable[..., str]
+from tests.examples.scripts import EXAMPLES
 
 
 @pytest.fixture(autouse=True)
@@ -30,34 +23,6 @@ def store(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give a script a store of configurations of its own to register in, as a process has."""
     store = ConfigStore.instance()
     monkeypatch.setattr(store, "repo", deepcopy(store.repo))
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run an example with arguments and return what it prints."""
-
-    def run(name: str, *arguments: object) -> str:
-        script = str(EXAMPLES / f"{name}.py")
-        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
-        runpy.run_path(script, run_name="__main__")
-        return capsys.readouterr().out
-
-    return run
-
-
-@pytest.fixture
-def load() -> Callable[[str], ModuleType]:
-    """Import an example, without running it."""
-
-    def load(name: str) -> ModuleType:
-        spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module
-
-    return load
 
 
 class Optimized:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.examples.conftest import Optimized
+from tests.examples.scripts import run
 
 Run = Callable[..., str]
 
@@ -15,7 +16,7 @@ def violations(printed: str) -> list[int]:
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_stable_baselines(run: Run, algorithm: str) -> None:
+def test_stable_baselines(algorithm: str) -> None:
     pytest.importorskip("stable_baselines3", reason="of the extra 'bench'")
     steps = {"ppo": 256, "sac": 140}[algorithm]
     safe = run("stable_baselines", "--algorithm", algorithm, "--steps", steps)
@@ -25,7 +26,7 @@ def test_stable_baselines(run: Run, algorithm: str) -> None:
     assert sum(violations(unsafe)) > 10
 
 
-def test_single_file_ppo(run: Run, optimized: Optimized) -> None:
+def test_single_file_ppo(optimized: Optimized) -> None:
     arguments = ("--steps", 480, "--agents", 4, "--length", 60)
     assert violations(run("single_file_ppo", *arguments)) == [0, 0]
     optimized.assert_all_learned()

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from torch import Tensor
 from cnfp_torchrl.envs import constrain_env, constraint_bijectors
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from tests.examples.conftest import Optimized
+from tests.examples.scripts import load, run
 
 Run = Callable[..., str]
 
@@ -21,12 +21,12 @@ def counts(printed: str) -> list[int]:
     return [int(count) for count in re.findall(r": (\d+) violations in 256 steps", printed)]
 
 
-def test_learns_within_both_limits(run: Run, optimized: Optimized) -> None:
+def test_learns_within_both_limits(optimized: Optimized) -> None:
     assert counts(run("arm", "--steps", 256)) == [0, 0]
     optimized.assert_all_learned()
 
 
-def test_without_the_limits_it_breaks_them(run: Run) -> None:
+def test_without_the_limits_it_breaks_them() -> None:
     speed, _ = counts(run("arm", "--steps", 256, "--unsafe"))
     assert speed > 50
 
@@ -44,9 +44,7 @@ def end_points(angles: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [1.0, 1e6])
-def test_no_drive_gets_the_end_point_to_the_wall_or_beyond_its_speed(
-    load: Callable[[str], ModuleType], size: float
-) -> None:
+def test_no_drive_gets_the_end_point_to_the_wall_or_beyond_its_speed(size: float) -> None:
     script = load("arm")
     arm = script.Arm(64)
     env = constrain_env(arm, script.Speed("speed"), script.Wall("wall"))

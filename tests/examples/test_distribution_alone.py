@@ -1,12 +1,13 @@
 """The distribution alone: its own numbers agree with each other."""
 
 import re
-from collections.abc import Callable
 
 import pytest
 
+from tests.examples.scripts import run
 
-def test_contained_and_normalized(run: Callable[..., str]) -> None:
+
+def test_contained_and_normalized() -> None:
     printed = run("distribution_alone", "--samples", 20000, "--grid", 1000)
     assert "0 of 20000 samples outside" in printed
     (total,) = re.findall(r"integrates to (\S+)", printed)

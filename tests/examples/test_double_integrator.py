@@ -1,6 +1,5 @@
 """The barrier of the double integrator is invariant, and no control crosses the wall."""
 
-from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
@@ -9,12 +8,14 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from tests.examples.scripts import load, run
+
 DT, NORMAL, BRAKING = 0.05, np.array([0.6, 0.8]), 0.9 * 1.4
 TOWARDS = torch.tensor([0.6, 0.8])
 
 
 @pytest.fixture
-def script(load: Callable[[str], ModuleType]) -> ModuleType:
+def script() -> ModuleType:
     return load("double_integrator_cbf")
 
 
@@ -105,7 +106,7 @@ def stopping(speed: np.ndarray) -> np.ndarray:
     return DT * towards / 2 + towards**2 / (2 * BRAKING)
 
 
-def test_prints_the_outcome(run: Callable[..., str]) -> None:
+def test_prints_the_outcome() -> None:
     printed = run("double_integrator_cbf", "--steps", 100, "--agents", 16)
     assert "0 of 16 agents crossed the wall" in printed
     assert "0 of 1600 steps beyond" in printed

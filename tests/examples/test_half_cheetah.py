@@ -3,9 +3,7 @@
 import ast
 import re
 import tokenize
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
 
 from cnfp_torchrl.envs import ConstraintAnchor, constraint_bijectors
 from cnfp_torchrl.modules import ConstrainedFlowModule
+from tests.examples.scripts import load, run
 
 pytest.importorskip("mujoco", reason="needs MuJoCo, of the extra 'examples'")
 
@@ -43,9 +42,7 @@ def powers(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 JOINTS = ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
 
 
-def test_learns_within_the_limit(
-    run: Callable[..., str], powers: list[float], optimized: Any
-) -> None:
+def test_learns_within_the_limit(powers: list[float], optimized: Any) -> None:
     printed = run("half_cheetah_power", "--steps", 64)
     assert len(powers) == 64
     assert max(powers) <= 20
@@ -56,9 +53,7 @@ def test_learns_within_the_limit(
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_hostile_actions_meet_the_limit_and_not_more(
-    scale: float, load: Callable[[str], ModuleType], powers: list[float]
-) -> None:
+def test_hostile_actions_meet_the_limit_and_not_more(scale: float, powers: list[float]) -> None:
     """Full torque along the velocities at every step: the limit binds nearly always."""
 
     def along(observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -88,7 +83,7 @@ def test_unlimited_it_draws_more(powers: list[float]) -> None:
     assert max(powers) > 25
 
 
-def test_rate_and_power_together(run: Callable[..., str], powers: list[float]) -> None:
+def test_rate_and_power_together(powers: list[float]) -> None:
     printed = run("half_cheetah_limits", "--steps", 64)
     assert len(powers) == 64
     assert max(powers) <= 20

@@ -4,9 +4,7 @@ import ast
 import re
 import runpy
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,7 @@ from tensordict import TensorDictBase
 from cnfp_torchrl.envs import constrain_env
 from cnfp_torchrl.objectives import ConstrainedPPOLoss
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
-
-EXAMPLES = Path(__file__).resolve().parents[2] / "experiments" / "examples"
+from tests.examples.scripts import EXAMPLES, load, run
 
 TINY: dict[str, tuple[object, ...]] = {
     "sac_made_safe": ("--steps", 512, "--agents", 16, "--updates", 2),
@@ -70,9 +67,7 @@ def executed(monkeypatch: pytest.MonkeyPatch) -> Executed:
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_learns_and_breaks_nothing(
-    name: str, run: Callable[..., str], executed: Executed, optimized: Any
-) -> None:
+def test_learns_and_breaks_nothing(name: str, executed: Executed, optimized: Any) -> None:
     printed = run(name, *TINY[name])
     steps = len(np.concatenate(executed.actions))
     assert steps >= 512
@@ -82,9 +77,7 @@ def test_learns_and_breaks_nothing(
     optimized.assert_all_learned()
 
 
-def test_without_the_line_it_breaks_constraints(
-    run: Callable[..., str], executed: Executed
-) -> None:
+def test_without_the_line_it_breaks_constraints(executed: Executed) -> None:
     printed = run("sac_made_safe", "--steps", 2048, "--agents", 32, "--updates", 0, "--unsafe")
     counts = executed.violations()
     assert counts["obstacle"] > 50
@@ -114,7 +107,7 @@ def test_the_marked_lines_are_all_that_makes_sac_safe(
     assert sum(executed.violations().values()) > 20
 
 
-def test_the_sac_actor_itself_learns(load: Callable[[str], ModuleType]) -> None:
+def test_the_sac_actor_itself_learns() -> None:
     script = load("sac_made_safe")
     env = constrain_env(PointNavEnv([8], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = script.make_actor(env)
@@ -126,9 +119,7 @@ def test_the_sac_actor_itself_learns(load: Callable[[str], ModuleType]) -> None:
         assert bool((parameter != first).any())
 
 
-def test_ppo_ratios_are_exact_before_each_update(
-    run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ppo_ratios_are_exact_before_each_update(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first loss of an iteration sees the data under the parameters that collected it."""
     fresh: list[TensorDictBase] = []
     forward = ConstrainedPPOLoss.forward

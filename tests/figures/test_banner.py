@@ -13,8 +13,8 @@ from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.figures.banner import flow_banner
+from tests.pictures import is_a_picture
 from tests.visual.cases import PLANE, first, make_snapshot
-from tests.visual.conftest import is_a_picture
 
 ROOT = Path(__file__).resolve().parents[2]
 

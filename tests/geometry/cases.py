@@ -22,6 +22,14 @@ from cnfp_torchrl.geometry import (
 from experiments.random_sets import FAMILIES
 
 DTYPES = (torch.float32, torch.float64)
+BOUNDS = Box(-torch.ones(2).double(), torch.ones(2).double())
+LEAST = 5e-5
+"""The depth in these bounds, 2 wide, in float64."""
+
+
+def t(*values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
 
 SIZES = (1e-3, 1.0, 1e3)
 BATCH_SHAPES = ((), (7,), (2, 1, 3))

@@ -30,16 +30,7 @@ from cnfp_torchrl.geometry import (
     chebyshev_center,
     lexicographic_anchor,
 )
-from tests.geometry.cases import DTYPES
-
-LEAST = 5e-5
-"""The depth in the bounds of the tests, 2 wide."""
-
-BOUNDS = Box(-torch.ones(2).double(), torch.ones(2).double())
-
-
-def t(*values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+from tests.geometry.cases import BOUNDS, DTYPES, LEAST, t
 
 
 def box(low: tuple[float, float], high: tuple[float, float]) -> Box:

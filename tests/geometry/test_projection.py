@@ -27,17 +27,14 @@ from cnfp_torchrl.geometry import (
     project,
     project_onto_intersection,
 )
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+from tests.geometry.cases import t
 
 
 def cube(dim: int, half: float = 1.0) -> Box:
     return Box(torch.full((dim,), -half).double(), torch.full((dim,), half).double())
 
 
-TIP = Ball(tensor(1.5, 0.0), tensor(0.6).squeeze())
+TIP = Ball(t(1.5, 0.0), t(0.6).squeeze())
 """Reaches 0.1 into the action bounds: the intersection is a thin slice with sharp ends."""
 
 
@@ -72,70 +69,68 @@ class Case:
 def random_ball(dim: int, seed: int) -> Ball:
     generator = torch.Generator().manual_seed(seed)
     direction = torch.randn(dim, generator=generator, dtype=torch.float64)
-    return Ball(1.2 * direction / direction.norm(), tensor(0.9).squeeze())
+    return Ball(1.2 * direction / direction.norm(), t(0.9).squeeze())
 
 
 CASES = (
     Case("bounds alone", (cube(3),)),
-    Case("two boxes", (cube(2), Box(tensor(-0.4, -2.0), tensor(0.3, 0.1)))),
-    Case("box and ball inside it", (cube(2), Ball(tensor(0.1, 0.2), tensor(0.3).squeeze()))),
-    Case("box and ball around it", (cube(2), Ball(tensor(0.1, 0.2), tensor(9.0).squeeze()))),
-    Case("box and ball across an edge", (cube(2), Ball(tensor(1.1, 0.2), tensor(0.9).squeeze()))),
-    Case("box and ball at a corner", (cube(2), Ball(tensor(1.5, 1.5), tensor(1.0).squeeze()))),
+    Case("two boxes", (cube(2), Box(t(-0.4, -2.0), t(0.3, 0.1)))),
+    Case("box and ball inside it", (cube(2), Ball(t(0.1, 0.2), t(0.3).squeeze()))),
+    Case("box and ball around it", (cube(2), Ball(t(0.1, 0.2), t(9.0).squeeze()))),
+    Case("box and ball across an edge", (cube(2), Ball(t(1.1, 0.2), t(0.9).squeeze()))),
+    Case("box and ball at a corner", (cube(2), Ball(t(1.5, 1.5), t(1.0).squeeze()))),
     Case("box and ball in a thin slice", (cube(2), TIP)),
-    Case("box and a huge ball", (cube(2), Ball(tensor(70.0, 20.0), tensor(73.0).squeeze()))),
+    Case("box and a huge ball", (cube(2), Ball(t(70.0, 20.0), t(73.0).squeeze()))),
     Case(
         "two boxes and a ball",
-        (cube(2), Box(tensor(-1, 0.2), tensor(0.6, 1.0)), Ball(tensor(0.9, 0.1), tensor(0.5)[0])),
+        (cube(2), Box(t(-1, 0.2), t(0.6, 1.0)), Ball(t(0.9, 0.1), t(0.5)[0])),
     ),
-    Case("box and ball, d = 1", (cube(1), Ball(tensor(0.9), tensor(0.4)[0]))),
+    Case("box and ball, d = 1", (cube(1), Ball(t(0.9), t(0.4)[0]))),
     Case("box and ball, d = 6", (cube(6), random_ball(6, 0))),
     Case("box and ball, d = 20", (cube(20), random_ball(20, 1))),
     Case(
         "two balls",
-        (cube(2), Ball(tensor(0.7, 0.2), tensor(0.8)[0]), Ball(tensor(-0.5, 0.0), tensor(0.8)[0])),
+        (cube(2), Ball(t(0.7, 0.2), t(0.8)[0]), Ball(t(-0.5, 0.0), t(0.8)[0])),
         rounds=200,
     ),
-    Case("half-space", (cube(2), HalfSpaces(tensor(1.0, 1.0)[None], tensor(0.3))), rounds=100),
+    Case("half-space", (cube(2), HalfSpaces(t(1.0, 1.0)[None], t(0.3))), rounds=100),
     Case(
         "three half-spaces",
         (
             cube(3),
             HalfSpaces(
                 torch.tensor([[1.0, 0.2, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 0.5]]).double(),
-                tensor(0.4, 0.1, torch.inf),
+                t(0.4, 0.1, torch.inf),
             ),
         ),
         rounds=200,
     ),
     Case(
         "half-space and ball",
-        (cube(2), HalfSpaces(tensor(0.0, -2.0)[None], tensor(0.0)), random_ball(2, 3)),
+        (cube(2), HalfSpaces(t(0.0, -2.0)[None], t(0.0)), random_ball(2, 3)),
         rounds=300,
         error=1e-4,
     ),
-    Case("weighted L1 ball", (cube(3), WeightedL1Ball(tensor(3.0, -0.5, 0.0), tensor(1.1)[0]))),
+    Case("weighted L1 ball", (cube(3), WeightedL1Ball(t(3.0, -0.5, 0.0), t(1.1)[0]))),
     Case(
         "weighted L1 ball in a box beside 0",
         (
             cube(3),
-            Box(tensor(0.1, -0.9, -2.0), tensor(0.7, -0.2, 0.4)),
-            WeightedL1Ball(tensor(1.0, 1.5, 2.0), tensor(1.3)[0]),
+            Box(t(0.1, -0.9, -2.0), t(0.7, -0.2, 0.4)),
+            WeightedL1Ball(t(1.0, 1.5, 2.0), t(1.3)[0]),
         ),
     ),
-    Case("positive part", (cube(3), PositivePart(tensor(2.0, -1.0, 0.7), tensor(0.6)[0]))),
+    Case("positive part", (cube(3), PositivePart(t(2.0, -1.0, 0.7), t(0.6)[0]))),
     Case(
         "ellipsoid",
-        (cube(2), Ellipsoid(tensor(0.2, -0.1), tensor(0.6, 0, -0.3, 0.2).reshape(2, 2))),
+        (cube(2), Ellipsoid(t(0.2, -0.1), t(0.6, 0, -0.3, 0.2).reshape(2, 2))),
         rounds=200,
     ),
     Case(
         "task-space ball, unbounded",
         (
             cube(3),
-            TaskSpaceBall(
-                tensor(1.0, 0.3, 0, -0.5, 0.8, 0).reshape(2, 3), tensor(0.1, 0.2), tensor(0.4)[0]
-            ),
+            TaskSpaceBall(t(1.0, 0.3, 0, -0.5, 0.8, 0).reshape(2, 3), t(0.1, 0.2), t(0.4)[0]),
         ),
         rounds=200,
     ),
@@ -143,8 +138,8 @@ CASES = (
         "limits of power and effort",
         (
             cube(3),
-            WeightedL1Ball(tensor(8.0, -5.0, 1.0), tensor(6.0)[0]),
-            TaskSpaceBall(torch.diag(tensor(0.9, -0.2, 0.5)), tensor(0, 0, 0), tensor(0.3)[0]),
+            WeightedL1Ball(t(8.0, -5.0, 1.0), t(6.0)[0]),
+            TaskSpaceBall(torch.diag(t(0.9, -0.2, 0.5)), t(0, 0, 0), t(0.3)[0]),
         ),
         rounds=400,
     ),
@@ -258,34 +253,34 @@ def test_gradients_are_finite_where_points_are_special(case: Case) -> None:
 
 
 def test_dropped_sets_are_left_out() -> None:
-    ball, box = Ball(tensor(5.0, 5.0), tensor(1.0)[0]), Box(tensor(-9, -9), tensor(-5, -5.0))
+    ball, box = Ball(t(5.0, 5.0), t(1.0)[0]), Box(t(-9, -9), t(-5, -5.0))
     sets, given = (cube(2), ball, box), torch.randn(50, 2, dtype=torch.float64)
     active = torch.tensor([True, False, False])
-    region = Region(sets, tensor(0, 0), active)
+    region = Region(sets, t(0, 0), active)
     closest = project_onto_intersection(region, given, 1)
     torch.testing.assert_close(closest, given.clamp(-1, 1), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_dropped_half_spaces_are_left_out(rows: int) -> None:
-    away = HalfSpaces(tensor(1.0, 0.0).expand(rows, 2), tensor(-5.0).expand(rows))
+    away = HalfSpaces(t(1.0, 0.0).expand(rows, 2), t(-5.0).expand(rows))
     given = torch.randn(50, 2, dtype=torch.float64)
-    region = Region((cube(2), away), tensor(0, 0), torch.tensor([True, False]))
+    region = Region((cube(2), away), t(0, 0), torch.tensor([True, False]))
     closest = project_onto_intersection(region, given, 3)
     torch.testing.assert_close(closest, given.clamp(-1, 1), rtol=0, atol=0)
 
 
 def test_each_batch_element_has_its_own_flags() -> None:
-    ball = Ball(torch.zeros(2, 2).double(), tensor(0.5, 0.5))
+    ball = Ball(torch.zeros(2, 2).double(), t(0.5, 0.5))
     active = torch.tensor([[True, True], [True, False]])
-    given = tensor(3.0, 0.0).expand(2, 2)
-    closest = project_onto_intersection(Region((cube(2), ball), tensor(0, 0), active), given, 1)
+    given = t(3.0, 0.0).expand(2, 2)
+    closest = project_onto_intersection(Region((cube(2), ball), t(0, 0), active), given, 1)
     torch.testing.assert_close(closest, torch.tensor([[0.5, 0.0], [1.0, 0.0]]).double())
 
 
 def test_more_rounds_come_closer() -> None:
-    balls = (Ball(tensor(0.7, 0.2), tensor(0.8)[0]), Ball(tensor(-0.5, 0.0), tensor(0.8)[0]))
-    region = Region((cube(2), *balls), tensor(0.1, 0.1))
+    balls = (Ball(t(0.7, 0.2), t(0.8)[0]), Ball(t(-0.5, 0.0), t(0.8)[0]))
+    region = Region((cube(2), *balls), t(0.1, 0.1))
     given = torch.randn(200, 2, dtype=torch.float64)
     best = project_onto_intersection(region, given, 2000)
     errors = [
@@ -333,19 +328,16 @@ def test_the_closest_visible_point_is_that_of_a_grid(rectangles: int, or_box: bo
 
 
 def test_a_rectangle_is_passed_on_the_nearer_side() -> None:
-    corners = tensor(0.5, -0.2, 0.7, 0.6).reshape(1, 2, 2)
-    seen = VisibleRegion(tensor(0, 0), corners, tensor(1.0)[0])
-    region = Region((cube(2), seen), tensor(-0.5, 0))
-    given = torch.stack(
-        [tensor(0.55, -0.1), tensor(0.9, -0.3), tensor(0.6, 0.6), tensor(-0.2, 0.9)]
-    )
+    corners = t(0.5, -0.2, 0.7, 0.6).reshape(1, 2, 2)
+    seen = VisibleRegion(t(0, 0), corners, t(1.0)[0])
+    region = Region((cube(2), seen), t(-0.5, 0))
+    given = torch.stack([t(0.55, -0.1), t(0.9, -0.3), t(0.6, 0.6), t(-0.2, 0.9)])
     # Before it, beside it on either side of its shadow, and where it is not in the way.
     below, above = (
-        torch.nn.functional.normalize(tensor(*corner), dim=-1)
-        for corner in [(0.5, -0.2), (0.5, 0.6)]
+        torch.nn.functional.normalize(t(*corner), dim=-1) for corner in [(0.5, -0.2), (0.5, 0.6)]
     )
     expected = torch.stack(
-        [tensor(0.5, -0.1), (given[1] @ below) * below, (given[2] @ above) * above, given[3]]
+        [t(0.5, -0.1), (given[1] @ below) * below, (given[2] @ above) * above, given[3]]
     )
     closest = project_onto_intersection(region, given, 1)
     torch.testing.assert_close(closest, expected, rtol=0, atol=1e-9)
@@ -361,19 +353,17 @@ def test_dropped_non_convex_sets_are_left_out() -> None:
 
 
 def test_non_convex_families_alone_have_no_closed_form() -> None:
-    walls = VisibleRegion.walls(tensor(-1, -1), tensor(1, 1))
-    region = VisibleRegion(tensor(0, 0), walls, tensor(1.0)[0])
+    walls = VisibleRegion.walls(t(-1, -1), t(1, 1))
+    region = VisibleRegion(t(0, 0), walls, t(1.0)[0])
     with pytest.raises(TypeError, match=r"or .* given VisibleRegion; .*project_onto_intersection"):
-        project(region, tensor(2, 2))
-    closest = project_onto_intersection(
-        Region((cube(2, 3.0), region), tensor(0, 0)), tensor(2, 2), 1
-    )
-    torch.testing.assert_close(closest, tensor(1, 1), rtol=0, atol=1e-12)
+        project(region, t(2, 2))
+    closest = project_onto_intersection(Region((cube(2, 3.0), region), t(0, 0)), t(2, 2), 1)
+    torch.testing.assert_close(closest, t(1, 1), rtol=0, atol=1e-12)
 
 
 def test_several_rows_have_no_closed_form_of_their_own() -> None:
     with pytest.raises(TypeError, match="expected HalfSpaces of one row, given 2"):
-        project(HalfSpaces(torch.eye(2).double(), tensor(1, 1)), tensor(2, 2))
+        project(HalfSpaces(torch.eye(2).double(), t(1, 1)), t(2, 2))
 
 
 @pytest.mark.parametrize(

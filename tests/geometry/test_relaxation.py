@@ -24,18 +24,10 @@ from cnfp_torchrl.geometry import (
     lexicographic_anchor,
     relaxation_floor,
 )
-
-DTYPES = (torch.float32, torch.float64)
-BOUNDS = Box(-torch.ones(2).double(), torch.ones(2).double())
-DEPTH = 5e-5
-"""In these bounds, in float64."""
+from tests.geometry.cases import BOUNDS, DTYPES, LEAST, t
 
 MORE = 2 * LEEWAY
 """The leeway in these bounds."""
-
-
-def t(*values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def number(value: float) -> Tensor:
@@ -68,7 +60,7 @@ def test_a_spending_cap_of_nothing_spends_nothing(dtype: torch.dtype) -> None:
         assert kept(sets, found, action)
         assert found.active.tolist() == [True, False]
         spent = cap.slack(action).double() * -1
-        assert spent.max() < 1.1 * (MORE + 2 * DEPTH)
+        assert spent.max() < 1.1 * (MORE + 2 * LEAST)
         assert (found.largest()[1] <= relaxation_floor(sets)[1]).all()
 
 
@@ -91,7 +83,7 @@ def test_an_equality_as_two_half_spaces(dtype: torch.dtype) -> None:
     action = actions_of(sets, found)
     assert kept(sets, found, action)
     # A distance, in the plane, of depth and leeway.
-    assert (action.sum(-1) - 1).abs().max() < 1.1 * 2**0.5 * (MORE + 2 * DEPTH)
+    assert (action.sum(-1) - 1).abs().max() < 1.1 * 2**0.5 * (MORE + 2 * LEAST)
     assert (found.largest()[1] <= relaxation_floor(sets)[1]).all()
     missed = [BOUNDS.to(dtype), HalfSpaces(t([1.0, 1.0], [-1.0, -1.0]), t(1.0, -1.01)).to(dtype)]
     assert (lexicographic_anchor(missed).largest()[1] > relaxation_floor(missed)[1]).all()
@@ -109,7 +101,7 @@ def test_a_barrier_entered_too_fast_brakes_as_hard_as_it_can(
     action = actions_of(sets, found)
     assert kept(sets, found, action)
     # What float32 knows of a far barrier is less, and so is what it can tell apart.
-    deep = DEPTH if dtype == torch.float64 else max(DEPTH, 160 * 1.2e-7 * 2 * speed)
+    deep = LEAST if dtype == torch.float64 else max(LEAST, 160 * 1.2e-7 * 2 * speed)
     assert action.max() < -1 + 1.1 * (MORE + 2 * deep)
     assert found.largest()[1] == pytest.approx(speed - 2 + MORE, abs=3 * deep)
 
@@ -119,7 +111,7 @@ def test_one_impossible_row_leaves_the_other_rows_alone() -> None:
     sets = [BOUNDS, rows]
     found = lexicographic_anchor(sets)
     amounts = found.relaxation[1]
-    assert amounts[0].item() == pytest.approx(4 + 2 * DEPTH + MORE, abs=0.1 * DEPTH)
+    assert amounts[0].item() == pytest.approx(4 + 2 * LEAST + MORE, abs=0.1 * LEAST)
     assert amounts[1:].tolist() == [0.0, 0.0]
     action = actions_of(sets, found)
     assert kept(sets, found, action)
@@ -134,16 +126,16 @@ def test_the_worst_of_several_impossible_rows_does_not_set_the_others_amounts() 
     rows = HalfSpaces(t([-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]), t(-5.0, 0.1, -0.5))
     amounts = lexicographic_anchor([BOUNDS, rows]).relaxation[1]
     # a_0 >= 5 misses by 4; a_1 <= .1 and a_1 >= .5 meet in the middle, each .2 off.
-    expected = t(4 + 2 * DEPTH, 0.2 + DEPTH, 0.2 + DEPTH) + MORE
-    torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * DEPTH)
+    expected = t(4 + 2 * LEAST, 0.2 + LEAST, 0.2 + LEAST) + MORE
+    torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * LEAST)
 
 
 def test_rows_that_miss_by_the_same_at_some_point_do_not_share_an_amount() -> None:
     """From the middle both rows miss by 2 where the first one is nearest; the second can do 1."""
     rows = HalfSpaces(t([1.0, 0.0], [0.0, 1.0]), t(-3.0, -2.0))
     amounts = lexicographic_anchor([BOUNDS, rows]).relaxation[1]
-    expected = t(2.0, 1.0) + 2 * DEPTH + MORE
-    torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * DEPTH)
+    expected = t(2.0, 1.0) + 2 * LEAST + MORE
+    torch.testing.assert_close(amounts, expected, rtol=0, atol=0.1 * LEAST)
 
 
 def test_depth_is_left_however_many_sets_give_way() -> None:
@@ -152,12 +144,12 @@ def test_depth_is_left_however_many_sets_give_way() -> None:
     sets.append(Ball(t(0.0, 0.0), number(1.0)))
     found = lexicographic_anchor(sets)
     assert found.active.tolist() == [True, False, False, True]
-    assert Region(tuple(sets), *found).slack(found.anchor) > DEPTH
+    assert Region(tuple(sets), *found).slack(found.anchor) > LEAST
     amounts = found.largest()
-    assert amounts[2].item() == pytest.approx(4 + 2 * DEPTH + MORE, abs=0.1 * DEPTH)
+    assert amounts[2].item() == pytest.approx(4 + 2 * LEAST + MORE, abs=0.1 * LEAST)
     # Where a_0 >= 1 - 2 depths - leeway is left, the ball lets a_1 go up to its square root.
-    high = ((1 - DEPTH) ** 2 - (1 - DEPTH - MORE) ** 2) ** 0.5
-    assert amounts[1].item() == pytest.approx(5 + DEPTH - high + MORE, rel=1e-3)
+    high = ((1 - LEAST) ** 2 - (1 - LEAST - MORE) ** 2) ** 0.5
+    assert amounts[1].item() == pytest.approx(5 + LEAST - high + MORE, rel=1e-3)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -184,7 +176,7 @@ def test_actions_of_any_unit_behave_alike(unit: float, dtype: torch.dtype) -> No
         expected, found = lexicographic_anchor(base), lexicographic_anchor(scaled)
         assert found.active.tolist() == expected.active.tolist()
         torch.testing.assert_close(
-            found.largest() / unit, expected.largest(), rtol=1e-3, atol=0.1 * DEPTH
+            found.largest() / unit, expected.largest(), rtol=1e-3, atol=0.1 * LEAST
         )
         assert kept(scaled, found, actions_of(scaled, found))
 
@@ -251,7 +243,7 @@ def test_leeway_is_asked_for() -> None:
     sets = [BOUNDS, Ball(t(3.0, 0.0), number(0.5))]
     narrow, wide = (lexicographic_anchor(sets, leeway=leeway) for leeway in (1e-5, 1e-2))
     added = (wide.largest() - narrow.largest())[1].item()
-    assert added == pytest.approx(2 * (1e-2 - 1e-5), abs=0.1 * DEPTH)
+    assert added == pytest.approx(2 * (1e-2 - 1e-5), abs=0.1 * LEAST)
 
 
 @pytest.mark.parametrize("relaxed", ["row", "point", "two"])

@@ -1,7 +1,6 @@
 """The head of a constrained actor: what it reads, what it draws, and how that is scored."""
 
 import copy
-import pickle
 import re
 from collections.abc import Callable
 
@@ -38,6 +37,7 @@ from cnfp_torchrl.modules import (
     make_constrained_actor,
     with_reference_entropy,
 )
+from tests.copies import EVERY_COPY
 from tests.point_nav import inside, make_actor
 
 FLOWS = ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
@@ -316,11 +316,7 @@ def test_the_projection_agrees_with_tanh_where_nothing_binds(state: TensorDictBa
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-@pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda actor: pickle.loads(pickle.dumps(actor))],
-    ids=["deep", "pickle"],
-)
+@EVERY_COPY
 def test_copies_act_alike_and_share_nothing(
     state: TensorDictBase, flow: str, copied: Callable[..., nn.Module]
 ) -> None:
@@ -335,9 +331,7 @@ def test_copies_act_alike_and_share_nothing(
     assert flow_head(other).order == flow_head(actor).order
 
 
-def test_state_dict_round_trip_holds_the_network_and_nothing_else(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_state_dict_round_trip_holds_the_network_and_nothing_else(state: TensorDictBase) -> None:
     actor = make_actor()
     network = nn.Sequential(nn.Linear(5, 4), nn.ReLU())  # of another size
     other = copy.deepcopy(actor)
@@ -425,9 +419,7 @@ def test_nothing_else_changes_the_bounds(change: Callable[..., nn.Module]) -> No
     assert torch.equal(head.bounds.high, before.high)
 
 
-def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_a_checkpoint_of_another_actors_loss_leaves_the_bounds_alone(env: TransformedEnv) -> None:
     def loss_of(spec: TensorSpec) -> SACLoss:
         network = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
         actor = make_constrained_actor(

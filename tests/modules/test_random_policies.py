@@ -85,9 +85,7 @@ def test_it_switches_after_the_stated_frames(env: TransformedEnv, frames: int, s
     assert random_steps(rollout) == [step < steps for step in range(6)]
 
 
-def test_unbatched_environments_count_single_frames(
-    env: TransformedEnv, state: TensorDictBase
-) -> None:
+def test_unbatched_environments_count_single_frames(state: TensorDictBase) -> None:
     policy = WarmUpPolicy(make_actor(Marked()), 2)
     assert [bool((policy(state[0].clone())["loc"] == 0).all()) for _ in range(4)] == [
         True,

@@ -4,9 +4,8 @@ import pytest
 
 from experiments.paper import statistics
 from tests.training.conftest import tiny_run
-from tests.visual.conftest import draws
 
-__all__ = ["draws", "tiny_run"]
+__all__ = ["tiny_run"]
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Particles before and after mappings."""
 
-from collections.abc import Callable
-
 import torch
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -10,6 +8,7 @@ from cnfp_torchrl.bijectors import BallSquash, BoxSquash, ShellSquash
 from cnfp_torchrl.geometry import Ball
 from cnfp_torchrl.visual.outlines import set_outline
 from experiments.paper.figures_mappings import MappingExample, draw_mappings, mapping_examples
+from tests.pictures import draws
 
 ZERO, VIEW = torch.zeros(2, dtype=torch.float64), (-1.2, 1.2, -1.2, 1.2)
 RADIUS = torch.tensor(0.8, dtype=torch.float64)
@@ -24,7 +23,7 @@ def webs(figure: Figure, panel: int) -> int:
     return len(web.get_segments())
 
 
-def test_particles_land_in_the_set(draws: Callable[[Figure], bool]) -> None:
+def test_particles_land_in_the_set() -> None:
     ball = Ball(ZERO, RADIUS)
     box = BoxSquash(ZERO - 0.5, ZERO + 0.5)
     examples = [

@@ -1,10 +1,7 @@
 """Panels that compare methods."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from cnfp_torchrl.visual.figures.canvas import new_figure
@@ -18,6 +15,7 @@ from experiments.paper.panels import (
     step_axis,
 )
 from experiments.paper.statistics import Band, Interval
+from tests.pictures import draws
 
 LABELS = [
     Label("first", "#4B2E83", "D"),
@@ -26,7 +24,7 @@ LABELS = [
 ]
 
 
-def test_curves_that_coincide_can_be_told(draws: Callable[[Figure], bool]) -> None:
+def test_curves_that_coincide_can_be_told() -> None:
     figure = new_figure(4, 3)
     axes = figure.add_subplot()
     x, zero = np.arange(30.0), np.zeros(30)
@@ -55,7 +53,7 @@ def test_count_axis_holds_zero_and_the_highest(name: str, highest: float, smalle
     assert smallest in ticks
 
 
-def test_estimates_and_what_is_said_without_one(draws: Callable[[Figure], bool]) -> None:
+def test_estimates_and_what_is_said_without_one() -> None:
     figure = new_figure(4, 3)
     axes = figure.add_subplot()
     estimates = [Interval(1.0, 0.8, 1.3, 2), Interval(2.0, 2.0, 2.0, 1), None]
@@ -67,7 +65,7 @@ def test_estimates_and_what_is_said_without_one(draws: Callable[[Figure], bool])
     assert draws(figure)
 
 
-def test_names_do_not_cover_each_other(draws: Callable[[Figure], bool]) -> None:
+def test_names_do_not_cover_each_other() -> None:
     figure = new_figure(5, 4)
     axes = figure.add_subplot()
     axes.set(xlim=(0, 1), ylim=(0, 1))

@@ -13,7 +13,7 @@ from experiments.paper.records import HostileRun, Record
 from experiments.paper.report import gather, judge, main, pages, write_report
 from experiments.paper.tables import in_words
 from tests.paper.synthetic import changed, hostile_run, make_evaluation, make_record, make_runs
-from tests.visual.conftest import is_a_picture
+from tests.pictures import is_a_picture
 
 HOSTILE = {"exact": [hostile_run("exact")]}
 FIRST_AIM = len(FLOW_CLAIMS) + len(BASELINE_CLAIMS) + 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -11,10 +10,9 @@ from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
-from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
-STEPS = 6
+STEPS = 4
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
 
 REFINEMENT = 5
@@ -129,7 +127,7 @@ def refined_attempt(
         The attempts in all states, side by side.
     """
     ascent = Ascent(sets, before.anchor, before.upper)
-    if not ascent.sees_all:
+    if not ascent.of.sees_all:
         return further_attempt(sets, depths, before, STEPS).select()
     largest = depths[0].amax(-1)
     for depth in depths[1:]:
@@ -149,43 +147,16 @@ def select_states(
 def _roomiest(
     sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
-    """Choose the points with the most slack beyond the depth."""
+    """Choose the points with the most slack beyond the largest depth of each set."""
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
-    slack, room = _smallest(sets, depths, stacked)
+    slacks = [s.slack(stacked) for s in sets]
+    room, slack = slacks[0] - depths[0].amax(-1), slacks[0]
+    for each, depth in zip(slacks[1:], depths[1:], strict=True):
+        room, slack = torch.minimum(room, each - depth.amax(-1)), torch.minimum(slack, each)
     room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
     slack = slack.gather(0, best).squeeze(0)
     # Not take_along_dim, with which an exported program would be one for a single batch size.
     index = best.unsqueeze(-1).expand(1, *shape, stacked.shape[-1])
     anchor = stacked.gather(0, index).squeeze(0)
     return Attempt(anchor, upper, (room.squeeze(0) >= 0) & (slack >= SHARE * upper))
-
-
-def _smallest(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the smallest slack of points, and the smallest beyond the depth.
-
-    Boxes are taken together, component by component: concatenating their rows takes longer than all
-    that is done with them.
-    """
-    box_slacks, box_rooms, slacks, rooms = [], [], [], []
-    for constraint_set, depth in zip(sets, depths, strict=True):
-        if isinstance(constraint_set, Box):
-            above, below = constraint_set.high - points, points - constraint_set.low
-            box_slacks.append(torch.minimum(above, below))
-            # In place, as most of the time of large batches is that of memory.
-            deep_above, deep_below = depth.chunk(2, -1)
-            box_rooms.append(torch.minimum(above.sub_(deep_above), below.sub_(deep_below)))
-        else:
-            slack = constraint_set.row_slacks(points)
-            slacks.append(_least(slack))
-            rooms.append(_least(slack - depth))
-    slacks.append(_least(reduce(torch.minimum, box_slacks)))
-    rooms.append(_least(reduce(torch.minimum, box_rooms)))
-    return reduce(torch.minimum, slacks), reduce(torch.minimum, rooms)
-
-
-def _least(values: Tensor) -> Tensor:
-    """Return the smallest of the last dimension: of few ones, `amin` takes twice as long."""
-    return reduce(torch.minimum, values.unbind(-1)) if values.shape[-1] <= 2 else values.amin(-1)

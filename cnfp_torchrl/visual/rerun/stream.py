@@ -129,7 +129,7 @@ class FlowStream:
 
     @property
     def counted_keys(self) -> list[NestedKey] | None:
-        """What is read of a step that is only counted, where it is there; None: maybe anything."""
+        """What is read of a step that is only counted, where it is there; None where unknown."""
         position = [] if self._map is None else self.setting.view.position_keys
         if self._map is not None and not position:
             return None

@@ -1,6 +1,5 @@
 """Learning curves show what was logged, and say what was not."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from torchrl.record.loggers import CSVLogger
 
 from cnfp_torchrl.visual import constraint_colors
 from cnfp_torchrl.visual.figures import learning_curves, read_scalars
+from tests.pictures import draws
 
 STEPS = [500, 1000, 1500]
 LOGGED = {
@@ -62,7 +62,7 @@ def test_broken_file_is_named(metrics: Path, content: str) -> None:
     assert str(path) in str(error.value)
 
 
-def test_every_curve_is_drawn_as_logged(metrics: Path, draws: Callable[[Figure], bool]) -> None:
+def test_every_curve_is_drawn_as_logged(metrics: Path) -> None:
     figure = learning_curves(read_scalars(metrics), title="a title")
     drawn = [line.get_ydata() for axes in figure.axes for line in axes.lines]
     for name, values in LOGGED.items():
@@ -93,13 +93,13 @@ def test_coinciding_zeros_stay_visible() -> None:
     assert low < 0 < 1 <= high
 
 
-def test_run_without_metrics_says_so(draws: Callable[[Figure], bool]) -> None:
+def test_run_without_metrics_says_so() -> None:
     figure = learning_curves({})
     assert "logger=csv" in texts(figure)
     assert draws(figure)
 
 
-def test_missing_return_and_counts_are_said(draws: Callable[[Figure], bool]) -> None:
+def test_missing_return_and_counts_are_said() -> None:
     figure = learning_curves({"loss/actor": (np.array([5.0]), np.array([1.0]))})
     assert "no episode ended" in texts(figure)
     assert "none counted" in texts(figure)

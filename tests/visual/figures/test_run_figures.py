@@ -14,7 +14,7 @@ from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_actor, build_environment
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.figures import draw_run_figures
-from tests.visual.conftest import is_a_picture
+from tests.pictures import is_a_picture
 
 FLOW_FIGURES = {"flow_permissive.png", "flow_restrictive.png"}
 ALL = {"learning_curves.png", "trajectories.png", *FLOW_FIGURES}

@@ -1,7 +1,5 @@
 """The pictures of flow stages show the policy's own stages, samples and sets."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -12,6 +10,7 @@ from matplotlib.path import Path as Polygon
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.visual import FlowSnapshot, constraint_colors
 from cnfp_torchrl.visual.figures import flow_stages
+from tests.pictures import draws
 from tests.visual.cases import (
     CONFLICT,
     LINE,
@@ -39,7 +38,7 @@ def drawn(axes: Axes, label: str) -> np.ndarray:
 
 @pytest.mark.parametrize("flow", FLOWS)
 @pytest.mark.parametrize("count", range(4))
-def test_a_panel_for_each_stage(count: int, flow: str, draws: Callable[[Figure], bool]) -> None:
+def test_a_panel_for_each_stage(count: int, flow: str) -> None:
     snapshot = make_snapshot(first(PLANE, count), flow)
     figure = flow_stages(snapshot)
     titles = [axes.get_title().split("\n")[0] for axes in stage_panels(figure, snapshot)]
@@ -114,7 +113,7 @@ def test_dropped_constraint_is_told_and_dotted() -> None:
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_one_action_component(flow: str, draws: Callable[[Figure], bool]) -> None:
+def test_one_action_component(flow: str) -> None:
     snapshot = make_snapshot(LINE, flow, dim=1)
     figure = flow_stages(snapshot)
     for axes in stage_panels(figure, snapshot):
@@ -125,7 +124,7 @@ def test_one_action_component(flow: str, draws: Callable[[Figure], bool]) -> Non
 
 
 @pytest.mark.parametrize("flow", ["exact", "radial", "unconstrained"])
-def test_three_action_components(flow: str, draws: Callable[[Figure], bool]) -> None:
+def test_three_action_components(flow: str) -> None:
     snapshot = make_snapshot(SPACE, flow, dim=3)
     figure = flow_stages(snapshot)
     assert "first two of 3" in figure.get_suptitle()
@@ -138,7 +137,7 @@ def test_three_action_components(flow: str, draws: Callable[[Figure], bool]) -> 
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-def test_saturated_policies_are_drawn(flow: str, draws: Callable[[Figure], bool]) -> None:
+def test_saturated_policies_are_drawn(flow: str) -> None:
     loc, scale = torch.tensor([1e6, -1e6]), torch.tensor([1e-8, 1e4])
     assert draws(flow_stages(make_snapshot(PLANE, flow, loc=loc, scale=scale)))
 

@@ -1,12 +1,9 @@
 """Episodes are drawn where they went, with what they broke."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tensordict.nn import TensorDictModule
 
@@ -14,6 +11,7 @@ from cnfp_torchrl.envs import Map, TaskView, find_task_view
 from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv
 from cnfp_torchrl.visual import constraint_colors
 from cnfp_torchrl.visual.figures import Episode, record_episodes, trajectories
+from tests.pictures import draws
 
 LAYOUTS = {
     "reference": Layout(),
@@ -81,7 +79,7 @@ def test_goals_are_filled_once_reached() -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_any_layout(layout: Layout, draws: Callable[[Figure], bool]) -> None:
+def test_any_layout(layout: Layout) -> None:
     env = PointNavEnv([4], layout=layout, max_steps=8, seed=0)
     policy = TensorDictModule(
         lambda observation: torch.ones_like(observation[..., :2]), ["observation"], ["action"]
@@ -108,7 +106,7 @@ class Plain(TaskView):
     map = Map((0.0, 4.0), (-1.0, 1.0))
 
 
-def test_a_map_is_enough(draws: Callable[[Figure], bool]) -> None:
+def test_a_map_is_enough() -> None:
     bare = episode(levels=None, goals=None, costs=np.zeros((3, 0)))
     figure = trajectories(Plain(), [bare])
     assert figure.axes[0].get_title() == "return 6.5"

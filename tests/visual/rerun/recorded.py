@@ -1,12 +1,14 @@
-"""Recordings of made-up steps, and their content read back."""
+"""Recordings of made-up steps, their content read back, and a server that shows them."""
 
 import subprocess
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import rerun as rr
-import rerun_cli
 import torch
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
@@ -15,13 +17,16 @@ from tensordict import TensorDictBase
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.rerun import FlowStream, flow_blueprint
+from cnfp_torchrl.visual.rerun.follow import is_listening
+from cnfp_torchrl.visual.rerun.viewers import LOOPBACK, executable, free_port
 from tests.visual.cases import make_actor, make_state
 
-RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+RERUN = executable()
 
 
-def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
-    """Write a recording to a file and close it."""
+@contextmanager
+def recorded(path: Path) -> Iterator[rr.RecordingStream]:
+    """Record into a file, which is closed at the end."""
     # In portions of a given size: by the clock, a busy machine would cut elsewhere.
     portions = rr.ChunkBatcherConfig.NEVER()
     portions.flush_num_bytes = 1 << 16
@@ -29,10 +34,9 @@ def record(path: Path, write: Callable[[rr.RecordingStream], object]) -> Path:
         "tests", recording_id="tests", send_properties=False, batcher_config=portions
     )
     stream.save(path)
-    write(stream)
+    yield stream
     stream.flush(timeout_sec=10)
     stream.disconnect()
-    return path
 
 
 def record_steps(
@@ -54,13 +58,11 @@ def record_steps(
         taken.append(transition)
     assert flow_head(actor).order == list(sets)
 
-    def write(stream: rr.RecordingStream) -> None:
+    with recorded(path) as stream:
         stream.send_blueprint(flow_blueprint(actor, projections=projections))
         flow_stream = FlowStream(stream, actor, projections=projections, samples=64)
         for step, transition in enumerate(taken):
             flow_stream.log_step(step, transition)
-
-    record(path, write)
     return taken
 
 
@@ -95,3 +97,19 @@ def compare(one: Path, other: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [RERUN, "rrd", "compare", str(one), str(other)], capture_output=True, text=True, check=False
     )
+
+
+@contextmanager
+def viewer_server() -> Iterator[tuple[int, psutil.Popen]]:
+    """Start a viewer's server, the real program without its window; give its port and process."""
+    port = free_port()
+    command = [RERUN, "--serve-grpc", "--bind", LOOPBACK, "--port", str(port)]
+    server = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not is_listening((LOOPBACK, port)):
+            assert server.poll() is None
+            time.sleep(0.05)
+        yield port, server
+    finally:
+        server.kill()
+        server.wait()

@@ -19,7 +19,7 @@ from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, StreamTransform
 from tests.visual.cases import Gaussian, make_actor
-from tests.visual.rerun.recorded import compare, read, record
+from tests.visual.rerun.recorded import compare, read, recorded
 
 
 def pipeline(batch: list[int]) -> tuple[TransformedEnv, SafeProbabilisticTensorDictSequential]:
@@ -37,8 +37,8 @@ EXECUTED = "/stages/3\\ obstacle/executed"
 def test_collector_with_a_hook(batch: list[int], agent: int, tmp_path: Path) -> None:
     env, actor = pipeline(batch)
     collected = []
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         collector = Collector(
             env,
             actor,
@@ -49,8 +49,6 @@ def test_collector_with_a_hook(batch: list[int], agent: int, tmp_path: Path) -> 
         )
         collected.extend(data.clone() for data in collector)
         collector.shutdown()
-
-    path = record(tmp_path / "recording.rrd", write)
     agents = max(env.batch_size.numel(), 1)
     steps = torch.cat([data.reshape(agents, -1)[agent] for data in collected])
     executed = read(path, EXECUTED, "Points2D:positions")
@@ -71,21 +69,16 @@ def test_a_hook_that_leaves_out_steps_records_what_the_stream_does(
     env, actor = pipeline(batch)
     agents = max(env.batch_size.numel(), 1)
     rollout = env.rollout(12, actor, break_when_any_done=False)
-
-    def by_hook(stream: rr.RecordingStream) -> None:
+    one, other = tmp_path / "hook.rrd", tmp_path / "stream.rrd"
+    with recorded(one) as stream:
         hook = StreamHook(FlowStream(stream, actor, env, every=5), agent)
         for part in rollout.split(frames, -1):
             hook(part)
         assert hook.frames == 12 * agents
-
-    def by_stream(stream: rr.RecordingStream) -> None:
+    with recorded(other) as stream:
         flow_stream = FlowStream(stream, actor, env, every=5)
         for step, transition in enumerate(rollout.reshape(agents, 12)[agent]):
             flow_stream.log_step(agents * step, transition)
-
-    one, other = (
-        record(tmp_path / f"{write.__name__}.rrd", write) for write in (by_hook, by_stream)
-    )
     assert list(read(one, EXECUTED, "Points2D:positions")) == [0, 5 * agents, 10 * agents]
     same = compare(one, other)
     assert same.returncode == 0, same.stderr
@@ -107,11 +100,9 @@ def test_steps_that_are_left_out_have_what_a_view_may_read(tmp_path: Path) -> No
     # The first two numbers are the place; what is observed stays as it was.
     rollout = env.rollout(6, actor, break_when_any_done=False)
     rollout["nested", "place"] = rollout["nested", "place"][..., :2]
-
-    def by_hook(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         StreamHook(FlowStream(stream, actor, env, every=3))(rollout)
-
-    path = record(tmp_path / "recording.rrd", by_hook)
     assert list(read(path, EXECUTED, "Points2D:positions")) == [0, 3]
 
 
@@ -119,12 +110,10 @@ def test_steps_that_are_left_out_have_what_a_view_may_read(tmp_path: Path) -> No
 def test_environment_with_a_transform(batch: list[int], agent: int, tmp_path: Path) -> None:
     env, actor = pipeline(batch)
     taken = []
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         env.append_transform(StreamTransform(FlowStream(stream, actor, env), agent))
         taken.append(env.rollout(6, actor, break_when_any_done=False))
-
-    path = record(tmp_path / "recording.rrd", write)
     steps = taken[0].reshape(-1, 6)[agent]
     executed = read(path, EXECUTED, "Points2D:positions")
     assert list(executed) == list(range(6))

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from cnfp_torchrl.visual.rerun import RerunLogger
-from tests.visual.rerun.recorded import read, record
+from tests.visual.rerun.recorded import read, recorded
 
 
 def test_scalars_are_in_the_file(tmp_path: Path) -> None:
@@ -87,13 +87,12 @@ def test_hyperparameters_are_a_text(make: type, tmp_path: Path) -> None:
 
 
 def test_given_stream_stays_open(tmp_path: Path) -> None:
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         logger = RerunLogger("run", stream=stream)
         logger.log_scalar("one", 1.0, step=0)
         logger.shutdown()
         stream.log("later", rr.Scalars(2.0))
-
-    path = record(tmp_path / "recording.rrd", write)
     assert read(path, "/later", "Scalars:scalars")[0].tolist() == [2.0]
 
 

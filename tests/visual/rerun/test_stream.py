@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from cnfp_torchrl import constrain_env
 from cnfp_torchrl.geometry import ConstraintSet
-from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
+from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
@@ -29,7 +29,7 @@ from tests.visual.cases import (
     make_snapshot,
     make_state,
 )
-from tests.visual.rerun.recorded import compare, read, record, record_steps
+from tests.visual.rerun.recorded import compare, read, record_steps, recorded
 
 
 @flows_in_cases("exact", "radial", "squash", "unconstrained")
@@ -112,13 +112,11 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
     rollout = env.rollout(7, actor, tensordict=start, auto_reset=False, break_when_any_done=False)[
         1
     ]
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         flow_stream = FlowStream(stream, actor, env)
         for step, transition in enumerate(rollout):
             flow_stream.log_step(10 * step, transition)
-
-    path = record(tmp_path / "recording.rrd", write)
     reward = rollout["next", "reward"].squeeze(-1).double()
     logged = read(path, "/series/reward", "Scalars:scalars")
     assert {step: value.item() for step, value in logged.items()} == {
@@ -150,15 +148,13 @@ def test_point_navigation_has_a_map_and_time_series(tmp_path: Path) -> None:
 
 def test_every_nth_step_is_logged_and_all_are_counted(tmp_path: Path) -> None:
     actor, state = make_actor(PLANE), make_state(PLANE)
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         flow_stream = FlowStream(stream, actor, every=3, samples=8)
         for step in range(8):
             transition = actor(state.clone())
             transition["next", "reward"] = torch.ones(1)
             flow_stream.log_step(step, transition)
-
-    path = record(tmp_path / "recording.rrd", write)
     returns = read(path, "/series/return", "Scalars:scalars")
     assert {step: value.item() for step, value in returns.items()} == {0: 1, 3: 4, 6: 7}
     executed = "/stages/1\\ bounds/executed"
@@ -168,12 +164,10 @@ def test_every_nth_step_is_logged_and_all_are_counted(tmp_path: Path) -> None:
 def test_a_second_stream_shows_nothing_of_the_first(tmp_path: Path) -> None:
     actor = make_actor(CONFLICT)
     dropped, kept = make_state(CONFLICT), make_state(CONFLICT | {"far": CONFLICT["near"]})
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         for step, state in enumerate((dropped, kept)):
             FlowStream(stream, actor, samples=8).log_step(step, actor(state))
-
-    path = record(tmp_path / "recording.rrd", write)
     lines = read(path, "/stages/2\\ far/own_set_dropped", "LineStrips2D:strips")
     assert len(lines[0]) > 0
     assert len(lines[1]) == 0
@@ -182,13 +176,12 @@ def test_a_second_stream_shows_nothing_of_the_first(tmp_path: Path) -> None:
 def test_a_heading_begins_the_explanation(tmp_path: Path) -> None:
     actor = make_actor(PLANE)
     transition = actor(make_state(PLANE))
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         flow_stream = FlowStream(stream, actor, samples=8)
         flow_stream.log_step(0, transition)
         flow_stream.log_step(1, transition, "The same again")
-
-    words = read(record(tmp_path / "r.rrd", write), "/explanation", "TextDocument:text")
+    words = read(path, "/explanation", "TextDocument:text")
     assert words[1].item() == f"The same again: {words[0].item()}"
 
 
@@ -217,7 +210,8 @@ def test_random_numbers_elsewhere_are_left_alone(tmp_path: Path) -> None:
     actor = make_actor(PLANE)
     transition = actor(make_state(PLANE))
     before = torch.random.get_rng_state()
-    record(tmp_path / "r.rrd", lambda stream: FlowStream(stream, actor).log_step(0, transition))
+    with recorded(tmp_path / "r.rrd") as stream:
+        FlowStream(stream, actor).log_step(0, transition)
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
@@ -226,7 +220,8 @@ def test_steps_with_gradients_are_logged(tmp_path: Path) -> None:
     transition = actor(make_state(PLANE))
     assert transition["action"].requires_grad
     path = tmp_path / "r.rrd"
-    record(path, lambda stream: FlowStream(stream, actor).log_step(0, transition))
+    with recorded(path) as stream:
+        FlowStream(stream, actor).log_step(0, transition)
     executed = read(path, "/stages/4\\ speed/executed", "Points2D:positions")[0]
     np.testing.assert_array_equal(executed[-1], transition["action"].detach().numpy())
 
@@ -239,16 +234,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_numbers_that_would_not_be_drawn_are_refused(case: str, tmp_path: Path) -> None:
+def test_numbers_that_would_not_be_drawn_are_refused(case: str) -> None:
     key, value, message = BROKEN[case]
     actor = make_actor(PLANE)
     transition = actor(make_state(PLANE)).set(key, value)
 
-    def write(stream: rr.RecordingStream) -> None:
-        with pytest.raises(ValueError, match=message):
-            FlowStream(stream, actor).log_step(5, transition)
-
-    record(tmp_path / "recording.rrd", write)
+    stream = FlowStream(rr.RecordingStream("tests"), actor)
+    with pytest.raises(ValueError, match=message):
+        stream.log_step(5, transition)
 
 
 ARGUMENTS = {
@@ -268,11 +261,6 @@ def test_bad_arguments_are_refused(case: str) -> None:
     arguments, dim, message = ARGUMENTS[case]
     with pytest.raises(ValueError, match=message):
         FlowStream(rr.RecordingStream("tests"), make_actor({}, dim=dim), **arguments)
-
-
-def test_flow_without_density_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"a flow with a density.*given ProjectionFlow"):
-        FlowStream(rr.RecordingStream("tests"), make_actor(PLANE, ProjectionFlow()))
 
 
 def test_batch_of_steps_is_refused() -> None:

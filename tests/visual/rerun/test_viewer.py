@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import rerun as rr
 import torch
 from rerun.experimental import ViewerClient, ViewerState
 
@@ -16,7 +15,7 @@ from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.rerun import TRAINING_PLOTS, FlowStream, RerunLogger, flow_blueprint
 from tests.visual.cases import LINE, SPACE, Gaussian
-from tests.visual.rerun.recorded import RERUN, record, record_steps
+from tests.visual.rerun.recorded import RERUN, record_steps, recorded
 
 DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 pytestmark = pytest.mark.skipif(
@@ -89,8 +88,8 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
     env = constrain_env(PointNavEnv([1], seed=0), BatteryGeometry(), ObstacleGeometry())
     actor = make_constrained_actor(Gaussian(torch.zeros(2), torch.ones(2)), env)
     rollout = env.rollout(STEPS, actor)[0]
-
-    def write(stream: rr.RecordingStream) -> None:
+    path = tmp_path / "recording.rrd"
+    with recorded(path) as stream:
         stream.send_blueprint(flow_blueprint(actor, env, training=TRAINING_PLOTS))
         logger = RerunLogger("run", stream=stream)
         flow_stream = FlowStream(stream, actor, env)
@@ -100,8 +99,7 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
                 logger.log_scalar(name, float(step), step=step)
             for name in ("violations/battery", "violations/obstacle"):
                 logger.log_scalar(name, 0.0, step=step)
-
-    views = opened(viewer, record(tmp_path / "recording.rrd", write), STEPS - 1)
+    views = opened(viewer, path, STEPS - 1)
     assert sorted(view.name for view in views) == sorted(
         [
             "Map",

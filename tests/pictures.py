@@ -1,9 +1,8 @@
 """What to ask of a picture."""
 
-from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -17,7 +16,7 @@ def is_a_picture(path: Path) -> bool:
         return image.format == "PNG" and min(image.size) > 100 and len(colors) > 40
 
 
-@pytest.fixture
-def draws(tmp_path: Path) -> Callable[[Figure], bool]:
-    """Whether a figure comes out as a picture."""
-    return lambda figure: is_a_picture(save_png(figure, tmp_path / "figure.png", dpi=60))
+def draws(figure: Figure) -> bool:
+    """Tell whether a figure comes out as a picture."""
+    with TemporaryDirectory() as folder:
+        return is_a_picture(save_png(figure, Path(folder) / "figure.png", dpi=60))
