@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from cnfp_torchrl.commands.extras import needs_extra
 
 with needs_extra("rerun"):
+    import psutil
+
     from cnfp_torchrl.visual.rerun.follow import Follower, Lost, NotStarted, is_being_written
     from cnfp_torchrl.visual.rerun.viewers import (
         PORT,
@@ -66,8 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     target.add_argument("--connect", metavar="URL", help="show it in a viewer that runs already")
     parser.add_argument("--memory-limit", default="2GiB", help="of the viewer (%(default)s)")
     given = parser.parse_args(arguments)
-    # An exception, with which what was started for this command ends, too.
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    before = signal.signal(signal.SIGTERM, _end)
     try:
         path = newest_recording(given.run)
         viewer = _viewer(given)
@@ -80,7 +82,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     except (FileNotFoundError, SinkError, NotStarted, Lost) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
+    finally:
+        signal.signal(signal.SIGTERM, before)
     sys.exit(status)
+
+
+def _end(number: int, _: object) -> None:
+    """End on a signal, and with this command what it has started, be it a moment ago."""
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            child.kill()
+    sys.exit(128 + number)
 
 
 def _viewer(given: argparse.Namespace) -> Viewer:

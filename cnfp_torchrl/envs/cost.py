@@ -165,10 +165,10 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
 
     They are, in this order of preference: those of the last `ConstraintCost` with indicators, the
     environment's ``constraint_names``, and those in the metadata of a wrapped Gymnasium env. Of
-    environments in a row, those of another one made like the first.
+    environments in a row, those of others made like them.
 
     Raises:
-        ValueError: when the environment names none.
+        ValueError: when the environment names none, or environments in a row do not agree.
     """
     for transform in reversed(appended_transforms(env)):
         if isinstance(transform, ConstraintCost) and transform.indicators is not None:
@@ -177,13 +177,7 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
     while isinstance(bare, TransformedEnv):
         bare = bare.base_env
     if isinstance(bare, BatchedEnvBase):
-        # Not the workers: they end when they are asked for what they have not, and one that is not
-        # started asks itself without end.
-        one: EnvBase = bare.create_env_fn[0](**bare.create_env_kwargs[0])
-        try:
-            return constraint_names(one)
-        finally:
-            one.close(raise_if_closed=False)
+        return _names_in_a_row(bare)
     names = getattr(env, "constraint_names", None) or (getattr(env, "metadata", None) or {}).get(
         "constraint_names"
     )
@@ -192,15 +186,30 @@ def constraint_names(env: EnvBase) -> tuple[str, ...]:
             f"env: expected one that names its constraints (constraint_names, or a ConstraintCost "
             f"with indicators), given {type(env).__name__}"
         )
-    if isinstance(names[0], str):
-        return tuple(names)
-    # SerialEnv and ParallelEnv give those of each of their environments.
-    first, *others = map(tuple, names)
-    if any(other != first for other in others):
+    return tuple(names)
+
+
+def _names_in_a_row(env: BatchedEnvBase) -> tuple[str, ...]:
+    """Return the names of other environments, made like those of a batched one.
+
+    Not of its workers: they end when they are asked for what they have not, and one that is not
+    started asks itself without end.
+    """
+    makers = list(zip(env.create_env_fn, env.create_env_kwargs, strict=True))
+    found: list[tuple[str, ...]] = []
+    for i, (make, options) in enumerate(makers):
+        if (make, options) in makers[:i]:
+            continue
+        one = make(**options)
+        try:
+            found.append(constraint_names(one))
+        finally:
+            one.close(raise_if_closed=False)
+    if len(set(found)) > 1:
         raise ValueError(
-            f"env: expected environments with the same constraint_names, given {list(names)}"
+            f"env: expected environments with the same constraint_names, given {found}"
         )
-    return first
+    return found[0]
 
 
 def refuse_misnamed_judges(constraints: Sequence[str], judged: Sequence[str]) -> None:

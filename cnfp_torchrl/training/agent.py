@@ -162,7 +162,8 @@ def _sizes(env: TransformedEnv) -> tuple[int, int]:
         raise ValueError(
             f"env.base: expected an environment that publishes a vector of floating numbers at "
             f"{OBSERVATION_KEY!r}, given one that publishes {kinds}; concatenate what the networks "
-            "are to read with torchrl.envs.CatTensors(in_keys=[...], out_key='observation')"
+            "are to read with torchrl.envs.CatTensors(in_keys=[...], out_key='observation', "
+            "del_keys=False, sort=False)"
         )
     return spec.shape[-1], env.action_spec_unbatched.shape[-1]
 

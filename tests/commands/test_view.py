@@ -1,9 +1,14 @@
 """``cnfp-view``: which recording, and what it says where it cannot show one."""
 
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
+import psutil
 import pytest
+import rerun as rr
 
 from cnfp_torchrl.commands.view import main, newest_recording
 
@@ -43,3 +48,22 @@ def test_what_cannot_be_viewed_is_explained(
         main([])
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [[], ["--follow"]], ids=["finished", "followed"])
+def test_a_served_recording_ends_with_the_command(options: list[str], tmp_path: Path) -> None:
+    """By SIGTERM, as when a terminal is closed or a service is stopped: no server is left."""
+    path = tmp_path / "recording.rrd"
+    with rr.RecordingStream("own") as stream:
+        stream.save(path)
+        stream.log("x", rr.Scalars(0.0))
+    command = [sys.executable, "-m", "cnfp_torchrl.commands.view", "--web", *options, str(path)]
+    with psutil.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith(f"{path}, open http")
+        while not (started := process.children(recursive=True)):
+            assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait() == 128 + signal.SIGTERM
+    _, left = psutil.wait_procs(started, timeout=60)
+    # One that nobody waits for any more runs no longer.
+    assert not [child for child in left if child.status() != psutil.STATUS_ZOMBIE]

@@ -187,10 +187,14 @@ def _start(
             start_new_session=in_own_session,
         )
         begun = time.monotonic()
-        while (age := time.monotonic() - begun) < STARTUP_S and process.poll() is None:
-            if age > settled_s and all(map(is_listening, addresses)):
-                return process
-            time.sleep(_POLL_S)
+        try:
+            while (age := time.monotonic() - begun) < STARTUP_S and process.poll() is None:
+                if age > settled_s and all(map(is_listening, addresses)):
+                    return process
+                time.sleep(_POLL_S)
+        except BaseException:  # such as that of a signal
+            _end(process)
+            raise
         _end(process)
         messages.seek(0)
         lines = messages.read().decode(errors="replace").strip().splitlines()

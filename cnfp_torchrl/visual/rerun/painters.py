@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rerun.components import ImageFormat
 from tensordict import TensorDictBase
 
-from cnfp_torchrl.envs import Boxes, Component, Discs, Map, Marks, Polyline, Shape
+from cnfp_torchrl.envs import Boxes, Component, Discs, Map, Marks, Polyline, Shape, TaskView
 from cnfp_torchrl.visual.colors import rgb
 from cnfp_torchrl.visual.outlines import Line
 from cnfp_torchrl.visual.rerun import entities, style
@@ -367,7 +367,8 @@ def _legend(setting: Setting) -> dict[str, style.Color]:
         "samples outside": style.BREAKS,
     }
     if setting.view.map is not None:
-        entries["goal"] = style.GOAL_COLOR
+        if type(setting.view).goal is not TaskView.goal:
+            entries["goal"] = style.GOAL_COLOR
         for shape in setting.view.map.shapes:
             # Areas speak for themselves; there is little room.
             if isinstance(shape, Marks) and shape.label:
