@@ -21,9 +21,7 @@ from cnfp_torchrl.geometry import (
     ConstraintSet,
     Gauge,
     Region,
-    gauge_of_sides,
     require_action_bounds,
-    sides,
 )
 
 
@@ -136,19 +134,20 @@ class _Retraction:
     def __init__(
         self, bounds: Box, boxes: Sequence[Box], others: Sequence[ConstraintSet], anchor: Tensor
     ) -> None:
-        self._anchor = anchor
-        self._above, self._below = bounds.high.reciprocal(), -bounds.low.reciprocal()
-        self._scale = None
+        self._anchor, self._high, self._low = anchor, bounds.high, bounds.low
+        # The factors of positive and of negative components.
+        self._above: Tensor | None = None
+        self._below: Tensor | None = None
         if boxes:
             low, high = bounds.low, bounds.high
             for box in boxes:
                 low = torch.maximum(low, box.low - anchor)
                 high = torch.minimum(high, box.high - anchor)
-            self._scale = _ComponentScale(high / bounds.high, low / bounds.low)
+            self._above, self._below = high / bounds.high, low / bounds.low
         self._inner = [other.gauge_about(anchor) for other in others]
 
     def forward(self, offset: Tensor) -> Tensor:
-        scaled, contraction = self._scaled_and_contraction(offset)
+        scaled, contraction, _ = self._scaled_and_contraction(offset)
         return self._contracted(scaled, contraction)
 
     def forward_and_log_det(self, offset: Tensor, log_slopes: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,9 +157,9 @@ class _Retraction:
             offset: offsets within the action bounds, ``(*batch, d)``.
             log_slopes: log-derivatives of the offset in the latent by component, ``(*batch, d)``.
         """
-        scaled, contraction = self._scaled_and_contraction(offset)
-        if self._scale is not None:
-            log_slopes = log_slopes + self._scale.log_slopes(offset)
+        scaled, contraction, factors = self._scaled_and_contraction(offset)
+        if factors is not None:
+            log_slopes = log_slopes + factors.log()
         log_det = log_slopes.sum(-1)
         if contraction is not None:
             log_det = torch.sub(log_det, contraction.log(), alpha=offset.shape[-1])
@@ -169,32 +168,50 @@ class _Retraction:
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the offset of an action and the log-determinant of the map from it to that."""
         offset = action - self._anchor
-        if self._scale is not None:
-            offset = self._scale.inverse(offset)
+        if (factors := self._factors(_ahead(offset))) is not None:
+            offset = offset / factors
         # The divisor of the result is that of the offset: it depends on the direction alone.
-        _, contraction = self._scaled_and_contraction(offset)
+        _, contraction, _ = self._scaled_and_contraction(offset)
         log_det = torch.zeros_like(offset[..., 0])
         if contraction is not None:
             offset = offset * contraction.unsqueeze(-1)
             log_det = offset.shape[-1] * contraction.log()
-        if self._scale is not None:
-            log_det = log_det - self._scale.log_slopes(offset).sum(-1)
+        if factors is not None:
+            log_det = log_det - factors.log().sum(-1)
         return offset, log_det
 
-    def _scaled_and_contraction(self, offset: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the offset scaled by the boxes, and the divisor r of the other sets."""
-        ahead, behind = sides(offset)
-        scaled = offset if self._scale is None else self._scale.forward(ahead, behind)
+    def _scaled_and_contraction(
+        self, offset: Tensor
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """Return the offset scaled by the boxes, the divisor r of the other sets, the factors."""
+        ahead = _ahead(offset)
+        factors = self._factors(ahead)
+        scaled = offset if factors is None else offset * factors
         if not self._inner:
-            return scaled, None
-        outer_gauge = gauge_of_sides(self._above, self._below, ahead, behind)
-        return scaled, contraction_along_rays(scaled, outer_gauge, self._inner)
+            return scaled, None, factors
+        outer_gauge = (offset / torch.lerp(self._low, self._high, ahead)).amax(-1)
+        return scaled, contraction_along_rays(scaled, outer_gauge, self._inner), factors
+
+    def _factors(self, ahead: Tensor) -> Tensor | None:
+        r"""Return :math:`\rho_i`, ``(*batch, d)``, by the sides that components point to."""
+        if self._above is None or self._below is None:
+            return None
+        return torch.lerp(self._below, self._above, ahead)
 
     def _contracted(self, scaled: Tensor, contraction: Tensor | None) -> Tensor:
         if contraction is None:
             return self._anchor + scaled
         # Not a quotient, whose gradient takes more passes.
         return torch.addcmul(self._anchor, scaled, contraction.reciprocal().unsqueeze(-1))
+
+
+def _ahead(offset: Tensor) -> Tensor:
+    """Return 1 for positive components and 0 for others, without a gradient.
+
+    With these weights `torch.lerp` selects exactly, and in a tenth of the time of `torch.where` at
+    large batches, whose every branch is a guess of the processor.
+    """
+    return offset.detach().sign().relu()
 
 
 def split(
@@ -209,34 +226,6 @@ def split(
         for constraint_set in sets
         if not (by_boxes and isinstance(constraint_set, Box))
     ]
-
-
-class _ComponentScale:
-    r"""The bijection :math:`v_i \mapsto v_i \rho_i`, with one factor for each sign of a component.
-
-    Args:
-        above: factors of positive components, ``(*batch, d)``, positive.
-        below: factors of negative components, ``(*batch, d)``, positive.
-    """
-
-    def __init__(self, above: Tensor, below: Tensor) -> None:
-        self._above, self._below = above, below
-        log_above, log_below = above.log(), below.log()
-        self._log_mean = torch.lerp(log_below, log_above, 0.5)
-        self._log_half_ratio = log_above - self._log_mean
-
-    def forward(self, ahead: Tensor, behind: Tensor) -> Tensor:
-        """Return the scaled offset ``(*batch, d)`` of an offset given by its `sides`."""
-        return torch.addcmul(ahead * self._above, behind, self._below, value=-1)
-
-    def inverse(self, scaled: Tensor) -> Tensor:
-        ahead, behind = sides(scaled)
-        return torch.addcdiv(ahead / self._above, behind, self._below, value=-1)
-
-    def log_slopes(self, offset: Tensor) -> Tensor:
-        r"""Return :math:`\log \rho_i` of each component, ``(*batch, d)``."""
-        # Arithmetic with the sign, not masks, which are slow to make and to convert.
-        return torch.addcmul(self._log_mean, offset.detach().sign(), self._log_half_ratio)
 
 
 def contraction_along_rays(offset: Tensor, outer_gauge: Tensor, inner: Sequence[Gauge]) -> Tensor:
