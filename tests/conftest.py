@@ -48,3 +48,11 @@ def seed() -> int:
     np.random.seed(value)  # noqa: NPY002  (libraries draw from the global generator)
     torch.manual_seed(value)
     return value
+
+
+@pytest.fixture
+def fresh_compiler() -> Iterator[None]:
+    """Forget compiled graphs, of which PyTorch keeps a limited number for each code object."""
+    torch.compiler.reset()
+    yield
+    torch.compiler.reset()

@@ -31,7 +31,7 @@ def audit_configured(config: DictConfig) -> AuditReport:
     audited, folder = config, None
     if config.run is not None:
         folder = RunFolder.open(config.run)
-        audited = folder.load_config(tuple(config.trusted))
+        audited = folder.load_config(config.trusted)
     env = build_environment(audited, batch_size=[config.batch], with_anchor=True)
     return audit(
         env,

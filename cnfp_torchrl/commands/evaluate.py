@@ -53,7 +53,7 @@ def main(config: DictConfig) -> None:
     require_settings(config)
     settings: EvaluationSettings = instantiate(config.evaluation)
     visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
-    trusted = tuple(config.trusted)
+    trusted = config.trusted
     folder = RunFolder.open(config.run, config.checkpoint)
     directory = Path(HydraConfig.get().runtime.output_dir)
     stream: AbstractContextManager[Any] = nullcontext()

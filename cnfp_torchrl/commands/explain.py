@@ -9,6 +9,7 @@ from dataclasses import replace
 from textwrap import fill
 
 from cnfp_torchrl.commands.extras import needs_extra
+from cnfp_torchrl.commands.trusted import TRUSTED
 
 with needs_extra("train"):
     import torch
@@ -104,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="cnfp-explain",
         description="Explain what a trained policy did in an episode: the steps worth a look, or "
         "one step, the action before and after each constraint, and why.",
+        parents=[TRUSTED],
     )
     parser.add_argument("run", help="folder of a finished run")
     which = parser.add_mutually_exclusive_group()
@@ -115,13 +117,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, help="of episode 0 (that of the run's evaluation)")
     parser.add_argument(
         "--deterministic", action="store_true", help="the deterministic policy, not the stochastic"
-    )
-    parser.add_argument(
-        "--trusted",
-        action="append",
-        default=[],
-        metavar="PACKAGE",
-        help="that the run's configuration may name beside this one, such as my_package.",
     )
     given = parser.parse_args(arguments)
     options = vars(given)

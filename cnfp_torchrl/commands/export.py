@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnfp_torchrl.commands.extras import needs_extra
+from cnfp_torchrl.commands.trusted import TRUSTED
 
 with needs_extra("train"):
     import torch
@@ -87,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="cnfp-export",
         description="Export a trained policy as one graph, from the observation to the allowed "
         "action, with a manifest and a self-test.",
+        parents=[TRUSTED],
     )
     parser.add_argument("run", help="folder of a finished run")
     parser.add_argument("--to", choices=FORMATS, default="onnx", help="format (onnx)")
@@ -104,13 +106,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--states", type=int, default=10_000, help="of the self-test (10000)")
     parser.add_argument("--seed", type=int, default=0, help="of the self-test (0)")
-    parser.add_argument(
-        "--trusted",
-        action="append",
-        default=[],
-        metavar="PACKAGE",
-        help="that the run's configuration may name beside this one, such as my_package.",
-    )
     options = vars(parser.parse_args(arguments))
     if missing := missing_packages([options["to"]]):
         parser.exit(

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from cnfp_torchrl.commands.paths import quoted_paths
 from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, errors_in_a_sentence, write_error
 from cnfp_torchrl.commands.side_by_side import begin_no_other, begin_run, is_side_by_side
-from cnfp_torchrl.configuration import config_directory
+from cnfp_torchrl.configuration import config_directory, refuse_unknown_settings
 from cnfp_torchrl.training.interruption import TrainingInterrupted
 
 R = TypeVar("R")
@@ -46,6 +46,7 @@ def hydra_command(
                 return _run_of_sweep(function, config)
             # Not left to Hydra, which prints the overrides before the cause.
             with errors_in_a_sentence():
+                refuse_unknown_settings(config)
                 return function(config)
 
         application = hydra.main(
@@ -79,6 +80,7 @@ def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
     try:
         if is_in_worker:
             begin_run()
+        refuse_unknown_settings(config)
         return function(config)
     except (SystemExit, TrainingInterrupted) as stop:
         if not is_in_worker:

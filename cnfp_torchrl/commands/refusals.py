@@ -5,17 +5,30 @@ from __future__ import annotations
 import dis
 import os
 import sys
+import sysconfig
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 
+import hydra
 from hydra.errors import HydraException, InstantiationException
 from omegaconf import MissingMandatoryValue
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError
 
 WITH_TRACEBACKS = os.environ.get("HYDRA_FULL_ERROR") == "1"
 """Whether the user asks for tracebacks, in Hydra's way."""
+
+_NOT_THE_USERS = (
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    str(Path(__file__).parents[1]),
+    "<",
+)
+"""The beginnings of files that are Python's, installed, this package's, or none."""
+
+_HYDRAS = str(Path(hydra.__file__).parent)
+"""The folder from which a target is called, which says nothing of a call that does not fit it."""
 
 
 @contextmanager
@@ -86,6 +99,11 @@ def _unknown_setting(error: ConfigAttributeError | ConfigKeyError) -> str:
     """Return which setting is not there, and which ones are."""
     section, _, name = str(error.full_key).rpartition(".")
     names = [str(key) for key in error.parent_node or () if key not in ("hydra", "_target_")]
+    if not names:
+        return (
+            f"{error.full_key}: expected no setting of {section}, which has none as it is chosen; "
+            f"choose another {section}=..., which --help lists"
+        )
     close = get_close_matches(name, names)
     examples = " or ".join(close) if close else f"one of {', '.join(names)}"
     where = f"a setting of {section}" if section else "a setting"
@@ -126,10 +144,19 @@ def _why_not_built(error: InstantiationException) -> str:
 
 
 def type_and_origin(error: BaseException) -> str:
-    """Return an error's type, words, and the file and line that raised it."""
+    """Return an error's type, words, and where it is from, if possible in the user's own code.
+
+    That is the innermost line of it, where a library that it called raised the error.
+    """
     # A syntax error names its file itself.
     frames = [] if isinstance(error, SyntaxError) else traceback.extract_tb(error.__traceback__)
-    origin = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_USERS)]
+    chosen = [*frames[-1:], *own][-1:]
+    origin = "".join(
+        f" ({frame.filename}, line {frame.lineno})"
+        for frame in chosen
+        if not frame.filename.startswith(_HYDRAS)
+    )
     return f"{type(error).__name__}: {_words(error)}{origin}"
 
 

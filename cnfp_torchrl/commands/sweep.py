@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from cnfp_torchrl.commands.extras import needs_extra
+from cnfp_torchrl.commands.trusted import TRUSTED
 
 with needs_extra("train"):
     from cnfp_torchrl.commands.paths import quoted
@@ -140,14 +141,13 @@ def resume(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print and write the table of a sweep, and go on with what is not done if asked to."""
     parser = argparse.ArgumentParser(
-        prog="cnfp-sweep", description="Tell what came of a sweep of cnfp-train -m."
+        prog="cnfp-sweep",
+        description="Tell what came of a sweep of cnfp-train -m.",
+        parents=[TRUSTED],
     )
     parser.add_argument("folder", type=Path, help="the sweep's folder, multirun/DATE/TIME")
     parser.add_argument("--resume", action="store_true", help="go on with runs that are not done")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time (1)")
-    parser.add_argument(
-        "--trusted", action="append", default=[], metavar="NAME", help="see cnfp-train's trusted"
-    )
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"--jobs: expected a number >= 1, given {options.jobs}")

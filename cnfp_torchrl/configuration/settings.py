@@ -67,6 +67,7 @@ NOT_NEGATIVE = Expected("a finite number >= 0", lambda x: _is_number(x) and x >=
 DISCOUNT = Expected("a discount in [0, 1)", lambda x: _is_number(x) and 0 <= x < 1)
 RATE = Expected("a number in (0, 1]", lambda x: _is_number(x) and 0 < x <= 1)
 RADIUS = Expected("a number > 0", lambda x: x == math.inf or POSITIVE.accepts(x))
+LOSS_FUNCTION = Expected("'l2', 'smooth_l1' or 'l1'", lambda x: x in ("l2", "smooth_l1", "l1"))
 PORT = Expected("a port from 1 to 65535", lambda x: COUNT.accepts(x) and x <= 65535)
 ENTROPY = Expected("a finite number or 'auto'", lambda x: x == "auto" or _is_number(x))
 COUNTS = Expected("a list of whole numbers >= 1", _list_of(COUNT.accepts))
@@ -87,6 +88,7 @@ EXPECTED = {
     "env.agents": COUNT,
     "env.order": NAMES,
     "env.gamma": DISCOUNT,
+    "env.loss_function": LOSS_FUNCTION,
     "env.target_entropy": ENTROPY,
     "env.penalty.penalty": POSITIVE,
     "env.score.zero": NUMBER,
@@ -95,6 +97,7 @@ EXPECTED = {
     "network.hidden": COUNTS,
     "loss.gamma": DISCOUNT,
     "loss.gamma_cost": DISCOUNT,
+    "loss.loss_function": LOSS_FUNCTION,
     "loss.target_entropy": ENTROPY,
     "loss.thresholds": COSTS,
     "loss.lambda_init": POSITIVE,

@@ -95,7 +95,8 @@ def require_trusted(
     Args:
         content: The configuration as plain data.
         trusted: The dotted names of further packages, modules or objects; what is defined in them
-            may be named and gets any argument. The empty name trusts everything.
+            may be named and gets any argument. The empty name trusts everything. A single one may
+            be given as a string.
         path: The file, for the message.
         trains: Whether the run is to be trained further, which also calls what the shipped
             configuration names for training alone, such as PyTorch's optimizers.
@@ -103,7 +104,9 @@ def require_trusted(
     Raises:
         PermissionError: naming file, position, target or argument, and the remedy.
     """
-    check = _Check(path, tuple(map(str.strip, trusted)), *(_shipped() if trains else ()))
+    # A single name is no list of its letters.
+    names = [trusted] if isinstance(trusted, str) else trusted or ()
+    check = _Check(path, tuple(map(str.strip, names)), *(_shipped() if trains else ()))
     check.walk(content, "", "", is_limited=False)
 
 

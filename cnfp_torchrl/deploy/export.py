@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -57,7 +58,7 @@ def export_policy(policy: DeployedPolicy, folder: str | Path, to: Format = "onnx
             f"folder: expected one without {held}, given {folder}; nothing is overwritten"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    with without_exporters_notices():
+    with without_exporters_notices(), _frozen(policy):
         if to == "onnx":
             _write_onnx(policy, file)
         elif to == "torch":
@@ -66,6 +67,19 @@ def export_policy(policy: DeployedPolicy, folder: str | Path, to: Format = "onnx
             torch._inductor.aoti_compile_and_package(_program(policy), package_path=str(file))
     write_manifest(folder, _manifest(policy, file, to))
     return file
+
+
+@contextmanager
+def _frozen(policy: DeployedPolicy) -> Iterator[None]:
+    """Let parameters ask for no gradients, for a loaded program gives actions as it was written."""
+    asked = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    for parameter in asked:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in asked:
+            parameter.requires_grad_(True)
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

@@ -58,8 +58,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     Args:
         name: The constraint's name, by which flow and order refer to it.
-        in_keys: The keys of the entries that `constraint_set` reads; values that are not finite are
-            refused.
+        in_keys: The keys of all entries that `constraint_set` and `safe_action` read, nested ones
+            as tuples or lists; values that are not finite are refused.
         margin: The distance in action units by which every action is to stay inside, such as an
             actuator's error. The published set is moved inwards by it.
         resolution: The grid to which actions are rounded, to the nearest point, before they are
@@ -74,10 +74,10 @@ class GeometryTransform(Transform, ConstraintPublisher):
     Raises:
         ValueError: for a bad or reserved name, a margin below 0 or a resolution that is no step.
         TypeError: for `in_keys` that are a string, and where `constraint_set` returns no set.
-        GeometryError: for input that is not finite, for a set that is not one, for a second family,
-            for a family that breaks the contract of `ConstraintSet` and, at the first batch, for
-            sets that depend on other states than their own, naming key or constraint and field,
-            and the batch index.
+        GeometryError: for reading other entries than `in_keys`, for input that is not finite, for a
+            set that is not one, for a second family, for a family that breaks the contract of
+            `ConstraintSet` and, at the first batch, for sets that depend on other states than their
+            own, naming key or constraint and field, and the batch index.
     """
 
     _family: type[ConstraintSet] | None = None
@@ -101,7 +101,9 @@ class GeometryTransform(Transform, ConstraintPublisher):
                 f"given {name!r}"
             )
         refuse_string("in_keys", in_keys)
-        super().__init__(in_keys=list(in_keys), out_keys=[(CONSTRAINTS_KEY, name)])
+        # A configuration has lists where nested keys are tuples.
+        keys = [tuple(key) if isinstance(key, list) else key for key in in_keys]
+        super().__init__(in_keys=keys, out_keys=[(CONSTRAINTS_KEY, name)])
         if not 0 <= margin < math.inf:
             raise ValueError(f"margin: expected a distance >= 0 in action units, given {margin}")
         if isinstance(resolution, int | float) and not 0 < resolution < math.inf:
@@ -221,15 +223,22 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if missing := [key for key in self.in_keys if key not in published]:
             raise KeyError(
                 f"constraint '{self.name}': expected to read {missing}, "
-                f"given an environment with {sorted(map(str, published))}"
+                f"given an environment with {sorted(map(str, published))}; {self._remedy()}"
             )
-        state = observation_spec.zero()
+        # Nothing else, as policies without an environment and replay buffers have nothing else.
+        state = observation_spec.zero().select(*self.in_keys)
         try:
             allowed = self.checked_set(state)
             entries = self.published(state, allowed)
             if state.numel():
                 self._refuse_what_follows_the_batch(state, allowed)
         except Exception as error:
+            if _is_missing_entry(error):
+                raise GeometryError(
+                    f"constraint '{self.name}': expected {type(self).__name__} to read no entries "
+                    f"of a state but its in_keys, {self.in_keys}, given one that needs others "
+                    f"({error.args[0]}); {self._remedy()}, of {sorted(map(str, published))}"
+                ) from error
             error.add_note(
                 "called for the zero of the observation spec, which need not be a state of the "
                 "environment, because the shapes and dtypes of the specs are those of the set "
@@ -363,6 +372,13 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _at(self, method: str) -> str:
         return f"constraint '{self.name}', {type(self).__name__}.{method}"
 
+    def _remedy(self) -> str:
+        return (
+            f"name all that it reads, as in {type(self).__name__}('{self.name}', "
+            "in_keys=['observation', ('nested', 'key')]), or in a configuration by in_keys: "
+            "[observation, [nested, key]]"
+        )
+
     def _own(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
         """Call a constraint's own code; its errors get the names of constraint and method."""
         try:
@@ -443,6 +459,15 @@ class GeometryTransform(Transform, ConstraintPublisher):
         for key in self.in_keys:
             name = f"constraint '{self.name}', key {key!r}"
             refuse_non_finite(name, states.get(key), error=GeometryError)
+
+
+def _is_missing_entry(error: BaseException) -> bool:
+    """Tell a tensordict's error of a missing entry from that of a constraint's own dictionary."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+    return isinstance(error, KeyError) and module.partition(".")[0] == "tensordict"
 
 
 class Check(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,11 @@ from cnfp_torchrl.geometry import (
 )
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import ConstraintBijector
+
+_OF_OTHERS = re.compile(
+    r"G\['__import_(?!(torch|torchrl|tensordict|cnfp_torchrl|typing|collections|math)(_dot_|'))"
+)
+"""Names of globals of other modules than these, as PyTorch's guards call them."""
 
 
 class Step(NamedTuple):
@@ -70,7 +76,10 @@ class StepGeometry:
             keys += [key for b in bijectors if b.name not in published for key in b.geometry_keys]
             self._keys = list(dict.fromkeys([*keys, SAFE_ACTION_KEY]))
             self._compiled = torch.compile(  # type: ignore[call-overload]  # unknown to its overloads
-                self._all_published, dynamic=False, isolate_recompiles=True
+                self._all_published,
+                dynamic=False,
+                isolate_recompiles=True,
+                options={"guard_filter_fn": _those_that_may_change},
             )
 
     def __call__(self, states: TensorDictBase) -> Step:
@@ -145,6 +154,15 @@ class StepGeometry:
                 )
             sets.append(allowed.to(self.bounds.dtype))
         return sets
+
+
+def _those_that_may_change(guards: Sequence[Any]) -> list[bool]:
+    """Tell which guards of a compiled function are looked at in each call.
+
+    Not those of what libraries and this one define, which are most and take most of the time of a
+    call: of what constraints read, their own attributes and their modules' globals remain.
+    """
+    return [not guard.is_global or bool(_OF_OTHERS.match(guard.name)) for guard in guards]
 
 
 def _flags(begun: Begun, checks: Sequence[Check]) -> tuple[Tensor, list[float]]:

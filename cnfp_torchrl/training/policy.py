@@ -68,16 +68,18 @@ class TrainedPolicy:
 
         Args:
             observation: What the environment of training publishes, ``(*batch, n)``: an array, or
-                where several entries are read (`in_keys`), a mapping with each of them.
+                where several entries are read (`in_keys`), a mapping with each of them, in which
+                nested ones may stand in mappings of their own.
 
         Raises:
+            TypeError: for an entry that is neither an array nor a tensor, nor a list of numbers.
             ValueError: for a missing entry, or one of another shape than the environment's.
             GeometryError: for numbers that are not finite.
             ConstraintViolationError: when the action is outside a set, which a network that
                 returns NaN would cause; then nothing is returned that could be executed.
         """
         given = observation if isinstance(observation, Mapping) else {self._only_key(): observation}
-        entries = {key: self._entry(key, given.get(key)) for key in self.in_keys}
+        entries = {key: self._entry(key, _found(given, key)) for key in self.in_keys}
         first = self.in_keys[0]
         batch = entries[first].shape[: entries[first].ndim - self._event_ndim(first)]
         state = TensorDict(entries, batch_size=batch)
@@ -85,7 +87,7 @@ class TrainedPolicy:
             for publisher in self._publishers:
                 state = publisher(state)
             action = self._policy(state).get(self.env.action_key)
-        is_numpy = isinstance(given[first], np.ndarray)
+        is_numpy = isinstance(_found(given, first), np.ndarray)
         return cast(Values, action.numpy() if is_numpy else action)
 
     def _only_key(self) -> NestedKey:
@@ -103,7 +105,12 @@ class TrainedPolicy:
             raise ValueError(
                 f"observation: expected the entries {self.in_keys}, {key!r} is missing"
             )
-        tensor = torch.as_tensor(value).to(spec.dtype)
+        try:
+            tensor = torch.as_tensor(value).to(spec.dtype)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(
+                f"observation, {key!r}: expected an array or a tensor of numbers, given {value!r}"
+            ) from None
         if tuple(tensor.shape[max(tensor.ndim - len(event), 0) :]) != event:
             raise ValueError(
                 f"observation, {key!r}: expected shape (*batch, {', '.join(map(str, event))}), as "
@@ -113,6 +120,16 @@ class TrainedPolicy:
 
     def _event_ndim(self, key: NestedKey) -> int:
         return self._specs[key].ndim - len(self.env.batch_size)
+
+
+def _found(observation: Mapping[Any, Any], key: NestedKey) -> Any:
+    """Return an entry by its key, or as Gymnasium nests it, ``observation["arm"]["angle"]``."""
+    if isinstance(key, str) or key in observation:
+        return observation.get(key)
+    found: Any = observation
+    for part in key:
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return found
 
 
 def _is_observed(key: NestedKey) -> bool:
@@ -138,10 +155,13 @@ def load_policy(
             shipped ones: ``["my_package."]``.
 
     Raises:
+        TypeError: for a run that is no path.
         FileNotFoundError: when the folder holds no finished run, or no best policy.
         ValueError: when its files are broken or do not fit each other.
         PermissionError: when its configuration names what is not trusted.
     """
+    if not isinstance(run, str | Path):
+        raise TypeError(f"run: expected the path of a run's folder, given {run!r}")
     folder = RunFolder.open(run, BEST if best else CHECKPOINT)
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[1])

@@ -15,7 +15,6 @@ import time
 from pathlib import Path
 
 import rerun as rr
-import rerun_cli
 import torch
 from PIL import Image
 from rerun.experimental import ViewerClient
@@ -28,6 +27,7 @@ from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual import replay_step
 from cnfp_torchrl.visual.rerun import FlowStream, flow_blueprint
+from cnfp_torchrl.visual.rerun.viewers import executable
 
 EPISODES, FRAMES = 16, 40
 NOTICES_S = 12.0
@@ -107,7 +107,7 @@ def main() -> None:
         viewer = ViewerClient.spawn(
             headless=True,
             port=port,
-            executable_path=str(Path(rerun_cli.__file__).with_name("rerun")),
+            executable_path=executable(),
             hide_welcome_screen=True,
             memory_limit="1GB",
         )

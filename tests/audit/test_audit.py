@@ -1,7 +1,7 @@
 """The audit on a disc of allowed actions, where every number it reports is known in closed form."""
 
 import json
-from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import pytest
@@ -93,27 +93,17 @@ def of(report: AuditReport, source: str, name: str = "disc") -> ConstraintMetric
     return found
 
 
-@pytest.fixture(scope="module")
-def reports() -> Callable[..., AuditReport]:
-    made: dict[tuple[float, float], AuditReport] = {}
-
-    def make(share: float, dropped_below: float = 0.0) -> AuditReport:
-        key = (share, dropped_below)
-        if key not in made:
-            env = with_geometry(Disc(512), Share_(*key))
-            made[key] = audit(env, state_setter=set_state, settings=SMALL)
-        return made[key]
-
-    return make
+@cache
+def audited(share: float, dropped_below: float = 0.0) -> AuditReport:
+    env = with_geometry(Disc(512), Share_(share, dropped_below))
+    return audit(env, state_setter=set_state, settings=SMALL)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 1.0])
 @pytest.mark.parametrize("source", ["rollouts", "uniform"])
 @pytest.mark.parametrize("name", ["disc", "together"])
-def test_coverage_is_the_known_one(
-    reports: Callable[..., AuditReport], share: float, source: str, name: str
-) -> None:
-    report = reports(share)
+def test_coverage_is_the_known_one(share: float, source: str, name: str) -> None:
+    report = audited(share)
     found = of(report, source, name)
     assert report.flaws == []
     assert found.coverage is not None
@@ -123,8 +113,8 @@ def test_coverage_is_the_known_one(
     assert found.gave_way.count == found.escaped.count == found.dead_ends.count == 0
 
 
-def test_tightness_is_the_known_one(reports: Callable[..., AuditReport]) -> None:
-    found = of(reports(0.8), "uniform")
+def test_tightness_is_the_known_one() -> None:
+    found = of(audited(0.8), "uniform")
     volume, slack = found.volume, found.slack
     assert None not in (*volume.values(), *slack.values())
     # A disc's share of the square, at limits between a half and one.
@@ -134,8 +124,8 @@ def test_tightness_is_the_known_one(reports: Callable[..., AuditReport]) -> None
     assert 0.78 < slack["max"] <= 0.8
 
 
-def test_too_large_a_set_is_caught_with_its_state(reports: Callable[..., AuditReport]) -> None:
-    report = reports(1.05)
+def test_too_large_a_set_is_caught_with_its_state() -> None:
+    report = audited(1.05)
     assert any("uniform" in flaw and "violate" in flaw for flaw in report.flaws)
     for source in ("rollouts", "uniform"):
         found = of(report, source)
@@ -158,9 +148,9 @@ def test_too_large_a_set_is_caught_with_its_state(reports: Callable[..., AuditRe
     assert f"{report.flaws[0].split(': ')[1].split(' actions')[0]}" in text
 
 
-def test_relaxed_states_are_counted(reports: Callable[..., AuditReport]) -> None:
+def test_relaxed_states_are_counted() -> None:
     below = 0.7
-    found = of(reports(0.9, below), "uniform")
+    found = of(audited(0.9, below), "uniform")
     assert found.relaxed.of == SMALL.states
     assert found.relaxed.low < (below - LOWEST) / (1 - LOWEST) < found.relaxed.high
     assert found.gave_way == found.relaxed
@@ -184,14 +174,14 @@ def test_relaxed_states_are_counted(reports: Callable[..., AuditReport]) -> None
     assert found.volume["min"] > 0.2
 
 
-def test_a_set_that_never_holds_is_a_flaw(reports: Callable[..., AuditReport]) -> None:
+def test_a_set_that_never_holds_is_a_flaw() -> None:
     """It is not unsound, and all violations happen while it is dropped."""
-    report = reports(0.8, 2.0)
+    report = audited(0.8, 2.0)
     (flaw,) = report.flaws
     states = sum(of(report, source).relaxed.of for source in ("rollouts", "uniform"))
     assert flaw.startswith(f"disc: holds in none of {states} states, relaxed in {states}, by 4.")
     assert flaw.endswith(f"its indicator allows an action in {states} of them")
-    assert not any("holds in none" in flaw for flaw in reports(0.8, 0.7).flaws)
+    assert not any("holds in none" in flaw for flaw in audited(0.8, 0.7).flaws)
     executed = report.executed.violations_while["disc"]
     assert executed == {"active": 0, "relaxed": report.executed.violations["disc"], "dropped": 0}
 
@@ -391,8 +381,8 @@ def test_nothing_to_try_is_refused(name: str) -> None:
         AuditSettings(**{name: 0})
 
 
-def test_json_holds_the_whole_report(reports: Callable[..., AuditReport]) -> None:
-    document = reports(1.05).as_dict()
+def test_json_holds_the_whole_report() -> None:
+    document = audited(1.05).as_dict()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["sources"]["uniform"]["disc"]["unsound"]["count"] > 0
     assert document["flaws"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -37,12 +37,7 @@ FLOWS = [
 Function = Callable[[Tensor, list[dict[str, Tensor]], Tensor], tuple[Tensor, Tensor]]
 
 
-@pytest.fixture(autouse=True)
-def fresh_compiler() -> Iterator[None]:
-    """Forget compiled graphs, of which PyTorch keeps a limited number for each code object."""
-    torch.compiler.reset()
-    yield
-    torch.compiler.reset()
+pytestmark = pytest.mark.usefixtures("fresh_compiler")
 
 
 def unchecked(case: Case, fields: list[dict[str, Tensor]]) -> tuple[ConstraintSet, ...]:

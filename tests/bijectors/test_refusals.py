@@ -25,7 +25,6 @@ from cnfp_torchrl.bijectors import (
 from cnfp_torchrl.geometry import Ball, Box, GeometryError, HalfSpaces, Region
 
 ONE, ZERO = torch.ones(2), torch.zeros(2)
-HALF = torch.ones(2, dtype=torch.bfloat16)
 BOX = Box(-ONE, ONE)
 
 
@@ -42,33 +41,22 @@ def unchecked_region(low: torch.Tensor, high: torch.Tensor) -> Region:
     return Region((Box(low, high, validate_args=False),), ZERO)
 
 
+# All that sets refuse stands in tests/geometry/test_validation.py; here one of each kind, and what
+# squashes need beyond that.
 REFUSED = {
     "low above high": (
         lambda: BoxSquash(torch.tensor([0.0, 2.0]), torch.tensor([1.0, 1.0])),
         "field 'low' at index [1]: expected low <= high",
     ),
     "low equal to high": (lambda: BoxSquash(ONE, ONE), "expected low < high, given low 1.0"),
-    "NaN bound": (lambda: BoxSquash(ZERO, ONE * torch.nan), "field 'high' at index [0]"),
     "unbounded": (lambda: BoxSquash(ZERO, ONE * torch.inf), "BoxSquash: expected finite bounds"),
     "thin box": (
         lambda: BoxSquash(1000 * ONE, torch.tensor([1001.0, 1000.001])),
         "bounds further apart than rounding error in torch.float32",
     ),
-    "half precision box": (
-        lambda: BoxSquash(-HALF, HALF),
-        "field 'low': expected a float32 or float64 tensor, given torch.bfloat16",
-    ),
-    "mixed precision": (
-        lambda: BoxSquash(-ONE, ONE.double()),
-        "expected one dtype for all fields, given",
-    ),
     "region of two precisions": (
         lambda: GaugeSquash(Region((BOX, Ball(ZERO.double(), ONE[0].double())), ZERO)),
         "sets and anchor: expected one dtype, given [torch.float32, torch.float64] and torch.float",
-    ),
-    "scalar bounds": (
-        lambda: BoxSquash(torch.tensor(-1.0), torch.tensor(1.0)),
-        "field 'low': expected at least 1 dimensions (*batch, ...), given shape ()",
     ),
     "negative radius": (
         lambda: BallSquash(ZERO, torch.tensor(-0.5)),
@@ -82,33 +70,13 @@ REFUSED = {
         lambda: BallSquash(1000 * ONE, torch.tensor(1e-3)),
         "expected a radius above rounding error in torch.float32, given radius",
     ),
-    "half precision ball": (
-        lambda: BallSquash(HALF, HALF[0]),
-        "given torch.bfloat16; convert it (half precision",
-    ),
-    "batches that do not broadcast": (
-        lambda: BallSquash(torch.zeros(3, 2), torch.ones(4)),
-        "expected batch shapes that broadcast, given {'center': (3, 2), 'radius': (4,)}",
-    ),
     "upper triangle": (
         lambda: EllipsoidSquash(ZERO, torch.ones(2, 2)),
         "field 'scale_tril' at index [0, 1]: expected zeros above the diagonal, given 1.0",
     ),
-    "negative diagonal": (
-        lambda: EllipsoidSquash(ZERO, -torch.eye(2)),
-        "field 'scale_tril' at index [0, 0]: expected a positive diagonal, given -1.0",
-    ),
     "ellipsoid below resolution": (
         lambda: EllipsoidSquash(1000 * ONE, 1e-3 * torch.eye(2)),
         "expected an ellipsoid wider than rounding error in torch.float32",
-    ),
-    "bounds that are no box": (
-        lambda: GaugeSquash(Region((Ball(ZERO, torch.tensor(1.0)), BOX), ZERO)),
-        "sets[0]: expected the Box of action bounds, given sets ['Ball', 'Box']",
-    ),
-    "dimensions that differ": (
-        lambda: GaugeSquash(Region((BOX, Ball(torch.zeros(3), torch.tensor(1.0))), ZERO)),
-        "expected one action dimension, given [2, 3] and 2",
     ),
     "bounds that were never checked": (
         lambda: GaugeSquash(unchecked_region(ONE, -ONE)),

@@ -21,6 +21,7 @@ REFUSED = {
     "env.score.one": ("another return than env.score.zero", ["-104.0"]),
     "network.hidden": ("a list of whole numbers >= 1", ["64", "[0]", "[64,wide]"]),
     "loss.gamma": ("a discount in [0, 1)", ["1.5", "abc", "nan"]),
+    "loss.loss_function": ("'l2', 'smooth_l1' or 'l1'", ["abc", "null", "2"]),
     "loss.target_entropy": ("a finite number or 'auto'", ["abc", "null", "inf"]),
     "target.tau": ("a number in (0, 1]", ["0", "1.5", "abc", "nan"]),
     "optim.lr": ("a finite number > 0", ["0", "-1", "abc", "null", "nan", "inf"]),
@@ -124,11 +125,14 @@ def test_no_other_number_is_whole(given: str) -> None:
         require_settings(compose_config(f"collector.total_frames={given}"))
 
 
-def test_a_task_states_discount_and_target_entropy_unless_they_are_given() -> None:
-    def losses(*overrides: str) -> tuple[Any, Any]:
-        loss = compose_config(*overrides).loss
-        return loss.gamma, loss.target_entropy
+def test_a_task_states_what_losses_take_unless_it_is_given() -> None:
+    names = ("gamma", "target_entropy", "loss_function")
 
-    assert losses() == (0.95, -4.0)
-    assert losses("loss.gamma=0.9", "loss.target_entropy=-1") == (0.9, -1)
-    assert losses("~env.gamma", "~env.target_entropy") == (0.99, "auto")
+    def losses(*overrides: str) -> list[Any]:
+        loss = compose_config(*overrides).loss
+        return [loss[name] for name in names]
+
+    assert losses() == [0.95, -4.0, "smooth_l1"]
+    given = [f"loss.{name}={value}" for name, value in zip(names, (0.9, -1, "l1"), strict=True)]
+    assert losses(*given) == [0.9, -1, "l1"]
+    assert losses(*(f"~env.{name}" for name in names)) == [0.99, "auto", "l2"]

@@ -167,6 +167,7 @@ def test_trust_reaches_no_further_than_its_name(own_package: str) -> None:
     assert refusal({"_target_": "own_pkg.Env"}, "own_pkg.Env") is None
     assert refusal({"_target_": "own_pkg.envs.np.load"}, "own_pkg.envs.np.load") is None
     assert refusal({"_target_": "own_pkg.envs.np.load"}, "") is None
+    require_trusted({"_target_": "own_pkg.Env"}, "own_pkg.", PATH)  # no list of its letters
     assert refusal({"_target_": "own_pkg_evil.Env"}, "own_pkg")
     assert refusal({"_target_": "own_pkg.Env"}, "own_pkg.envs.")
     assert refusal({"_target_": "own_pkg.Env"})

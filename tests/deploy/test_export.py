@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
+from cnfp_torchrl import GeometryTransform, HalfSpaces, constrain_env
 from cnfp_torchrl.deploy import (
     FORMATS,
     DeployedPolicy,
@@ -19,6 +21,7 @@ from cnfp_torchrl.deploy import (
     self_test,
 )
 from cnfp_torchrl.deploy.self_test import latencies, with_noise
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from experiments.exported import DIMENSIONS, policy_of
 from tests.deploy.conftest import actor_for
 
@@ -88,6 +91,38 @@ def test_onnx_file_and_manifest_are_enough_without_torch(
         open_exported(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"to: expected one of .* given 'tflite'"):
         export_policy(policy, tmp_path / "other", "tflite")
+
+
+class Rows(GeometryTransform):
+    """Half-spaces by unbinding, stacking and plain arithmetic, checked as a user's own are."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> HalfSpaces:
+        """Return five rows, of which two turn with the state."""
+        x, y, *_ = torch.unbind(tensordict["observation"], -1)
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        drift = 0.3 * (x - y)
+        normals = [(one, zero), (-one, zero), (zero, 1 + y / 2), (zero, -one), (1 + x / 2, one)]
+        offsets = [1 - drift, (1 + x) / 2 + 0.1, 0.5 * one, 1 - y, one + drift]
+        rows = [torch.stack(normal, -1) for normal in normals]
+        return HalfSpaces(torch.stack(rows, -2), torch.stack(offsets, -1))
+
+
+@COMPILERS
+def test_steps_inwards_and_sets_of_ones_own_are_exported_for_any_batch(tmp_path: Path) -> None:
+    env = constrain_env(PointNavEnv([8], seed=0), Rows("rows", ["observation"]))
+    actor = actor_for(env)
+    policy = DeployedPolicy(actor, env, steps=1)
+    export_policy(policy, tmp_path, "torch")
+    run = open_exported(tmp_path)
+    assert not run(*policy.examples(1))[0].requires_grad
+    assert all(parameter.requires_grad for parameter in policy.parameters())
+    for batch in (1, 2, 17, 300):
+        states = observed_states(policy, env, actor, batch)
+        found = self_test(policy, run, states)
+        assert found["states"] == batch
+        assert found["violations"] == found["fallback_out_of_bounds"] == 0
+        assert found["certified"] >= 0.9 * batch
+        assert found["largest_difference"] < 1e-5
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """The transform that executes no action that breaks a constraint, whoever chose it."""
 
 import copy
-import pickle
 from collections.abc import Callable
 from functools import partial
 
@@ -34,6 +33,7 @@ from cnfp_torchrl.tasks.point_nav import (
     PointNavEnv,
 )
 from cnfp_torchrl.training.networks import gaussian_network
+from tests.copies import EVERY_COPY
 from tests.walls import HOLDS, MISSED, Wall, Walls, Window, walls
 
 AGENTS = 16
@@ -70,9 +70,7 @@ def test_random_actions_raise_and_constrained_ones_do_not(batch_size: tuple[int,
     assert_guards(env, untrained_actor(env))
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deep", "pickle"]
-)
+@EVERY_COPY
 @pytest.mark.parametrize("used", [False, True], ids=["new", "used"])
 def test_copies(copied: Callable[[TransformedEnv], TransformedEnv], used: bool) -> None:
     env = guarded_env(AGENTS)

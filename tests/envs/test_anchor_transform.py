@@ -1,8 +1,6 @@
 """The transform that publishes the anchor of the allowed actions and which constraints hold."""
 
-import copy
 import itertools
-import pickle
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -39,6 +37,7 @@ from cnfp_torchrl.tasks.point_nav import (
     ObstacleGeometry,
     PointNavEnv,
 )
+from tests.copies import EVERY_COPY
 
 ORDER = ["battery", "obstacle"]
 
@@ -108,9 +107,7 @@ def test_on_the_gymnasium_environment() -> None:
     assert rollout["next", "cost"].sum() == 0
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deep", "pickle"]
-)
+@EVERY_COPY
 def test_copies(copied: Callable[[TransformedEnv], TransformedEnv]) -> None:
     env = point_nav(3)
     state, other = env.reset(), copied(env)

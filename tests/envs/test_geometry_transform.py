@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
 
@@ -198,6 +199,34 @@ def test_errors_of_a_constraints_own_code_name_it(error: Exception) -> None:
     by_whom, when = error.__notes__
     assert by_whom == "raised by constraint 'told', Told.constraint_set"
     assert "zero of the observation spec" in when
+
+
+class Undeclared(GeometryTransform):
+    """Reads an entry that its `in_keys` do not name, in one of its methods."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        if self.name == "set":
+            tensordict["cost"]
+        return Ball(torch.zeros(2), torch.tensor(1.0), validate_args=False)
+
+    def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor:
+        return 0 * tensordict["cost" if self.name == "action" else "observation"][..., :2]
+
+
+@pytest.mark.parametrize("name", ["set", "action"])
+def test_what_is_read_must_be_declared(name: str) -> None:
+    """Policies without an environment, exports and replay buffers have these entries alone."""
+    message = rf"'{name}': expected Undeclared to read .* its in_keys, \['observation'\].*cost"
+    with pytest.raises(GeometryError, match=message):
+        constrain_env(PointNavEnv([3]), Undeclared(name))
+    constrain_env(PointNavEnv([3]), Undeclared(name, ["observation", "cost"]))
+
+
+def test_keys_may_be_a_configurations_lists() -> None:
+    assert SpeedLimit("slow", [["arm", "speed"], "observation"]).in_keys == [  # type: ignore[list-item]
+        ("arm", "speed"),
+        "observation",
+    ]
 
 
 def one_half_space_a_state(state: TensorDictBase) -> HalfSpaces:

@@ -1,7 +1,5 @@
 """A constraint that cannot be had anywhere is told once; one that gives way at times is not."""
 
-import copy
-import pickle
 import warnings
 from collections.abc import Callable
 
@@ -14,6 +12,7 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from cnfp_torchrl.envs import GeometryTransform, RelaxedEverywhereWarning
 from cnfp_torchrl.envs.relaxation_watch import LOOKS, STATES
 from cnfp_torchrl.geometry import Ball, ConstraintSet
+from tests.copies import EVERY_COPY
 from tests.walls import HOLDS, MISSED, Wall, Walls, Window, walls
 
 
@@ -79,9 +78,7 @@ def test_later_batches_are_watched_too_but_not_for_ever() -> None:
     assert drive(env, LOOKS + 3) == []
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deep", "pickle"]
-)
+@EVERY_COPY
 def test_copies_watch_on(copied: Callable[[TransformedEnv], TransformedEnv]) -> None:
     env = walls(Walls([MISSED], 16))
     assert drive(env, 3) == []

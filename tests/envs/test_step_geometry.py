@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import pytest
@@ -112,6 +113,33 @@ def test_geometry_that_is_alone_publishes_itself(interpreted: list[Callable[...,
     battery = env.transform[0].clone()
     other = TransformedEnv(PointNavEnv([2], seed=0), battery)
     assert ("constraints", "battery", "center") in other.rollout(2)["next"].keys(True)
+
+
+ROOM = [1.0]
+"""What `Adjustable` reads; a constraint's own module, unlike libraries, may change."""
+
+
+class Adjustable(GeometryTransform):
+    radius = 1.0
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        x = tensordict["observation"][..., :2]
+        return Ball(x, torch.full_like(x[..., 0], self.radius + ROOM[0]), validate_args=False)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+def test_what_a_constraint_reads_may_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.compiler.reset()
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    geometry = Adjustable("near")
+    env = constrain_env(PointNavEnv([5], seed=0), geometry, compile=True)
+    state, radii = env.reset(), []
+    for radius, room in ((1.0, 1.0), (2.0, 1.0), (2.0, 2.0)):
+        geometry.radius, ROOM[0] = radius, room
+        state = env.step_mdp(env.step(state.set("action", torch.zeros(5, 2))))
+        radii.append(float(state["constraints", "near", "radius"].max()))
+    assert radii == [2.0, 3.0, 4.0]
 
 
 def test_without_an_anchor_nothing_would_call_it() -> None:

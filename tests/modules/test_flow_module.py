@@ -1,7 +1,6 @@
 """The head of a constrained actor: what it reads, what it draws, and how that is scored."""
 
 import copy
-import pickle
 import re
 from collections.abc import Callable
 
@@ -38,6 +37,7 @@ from cnfp_torchrl.modules import (
     make_constrained_actor,
     with_reference_entropy,
 )
+from tests.copies import EVERY_COPY
 from tests.point_nav import inside, make_actor
 
 FLOWS = ["exact", "gauge", "soft", "recession", "radial", "squash", "unconstrained"]
@@ -316,11 +316,7 @@ def test_the_projection_agrees_with_tanh_where_nothing_binds(state: TensorDictBa
 
 
 @pytest.mark.parametrize("flow", FLOWS)
-@pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda actor: pickle.loads(pickle.dumps(actor))],
-    ids=["deep", "pickle"],
-)
+@EVERY_COPY
 def test_copies_act_alike_and_share_nothing(
     state: TensorDictBase, flow: str, copied: Callable[..., nn.Module]
 ) -> None:

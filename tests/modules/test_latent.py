@@ -1,7 +1,5 @@
 """Constrained actors cut at the latent: exact ratios, shared networks, noise that stays allowed."""
 
-import copy
-import pickle
 import re
 from collections.abc import Callable
 from typing import Any
@@ -26,6 +24,7 @@ from cnfp_torchrl.modules import (
     split_at_latent,
     with_reference_entropy,
 )
+from tests.copies import EVERY_COPY
 from tests.point_nav import inside, make_actor, make_tanh_actor
 
 
@@ -125,7 +124,7 @@ def test_networks_are_shared_and_nothing_is_added() -> None:
     assert not flow.state_dict()
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
+@EVERY_COPY
 def test_both_parts_can_be_copied_and_sent(
     copied: Callable[[Any], Any], state: TensorDictBase
 ) -> None:

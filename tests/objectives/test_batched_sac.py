@@ -1,7 +1,6 @@
 """The SAC loss with batched critics against TorchRL's SACLoss, for the same weights and noise."""
 
 import copy
-import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +24,7 @@ from cnfp_torchrl.modules import with_reference_entropy
 from cnfp_torchrl.objectives import BatchedSACLoss
 from cnfp_torchrl.objectives.stacked_perceptron import StackedPerceptron
 from cnfp_torchrl.training.networks import action_cost_network, action_value_network
+from tests.copies import EVERY_COPY
 from tests.point_nav import make_actor
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -308,11 +308,7 @@ def test_training_goes_as_with_torchrl_s(batch: TensorDictBase) -> None:
         torch.testing.assert_close(states[1][key], expected, rtol=1e-2, atol=1e-3, msg=key)
 
 
-@pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))],
-    ids=["deepcopy", "pickle"],
-)
+@EVERY_COPY
 @pytest.mark.parametrize("critic", ["perceptron", "of its own"])
 def test_a_copy_learns_and_leaves_the_original_alone(
     batch: TensorDictBase, critic: str, copied: Callable[[Any], Any]

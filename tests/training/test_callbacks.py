@@ -3,22 +3,17 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
-import rerun_cli
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 from rerun.chunk import RrdReader
 from tensordict import TensorDictBase
 
@@ -29,14 +24,12 @@ from cnfp_torchrl.training.episodes import record_episode
 from cnfp_torchrl.training.run_folder import SUMMARY, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
-from cnfp_torchrl.visual.rerun import Recording, RunningViewer
-from tests.visual.rerun.recorded import read
+from cnfp_torchrl.visual.rerun import Recording
+from tests.visual.rerun.recorded import compare, read, viewer_server
 
 from .conftest import TinyRun
 
-RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 FILE = ["visual=file", "visual.samples=16"]
-Config = Callable[..., DictConfig]
 
 
 def steps_of(path: Path, entity: str, timeline: str = "env_step") -> list[int]:
@@ -47,11 +40,6 @@ def steps_of(path: Path, entity: str, timeline: str = "env_step") -> list[int]:
         if timeline in batch.schema.names:
             found += batch.column(timeline).to_pylist()
     return sorted(found)
-
-
-def compare(one: RunFolder, other: RunFolder) -> int:
-    recordings = [str(folder.path / "recording.rrd") for folder in (one, other)]
-    return subprocess.run([RERUN, "rrd", "compare", *recordings], check=False).returncode
 
 
 OFF = """
@@ -170,8 +158,10 @@ def test_watching_changes_nothing_and_one_seed_gives_one_recording(tiny_run: Tin
         assert one[1][key] == unwatched[1][key]
     states = [folder.load_checkpoint()["loss"] for folder in (one[0], unwatched[0])]
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
-    assert compare(one[0], other[0]) == 0
-    assert compare(one[0], different[0]) != 0
+    assert compare(one[0].path / "recording.rrd", other[0].path / "recording.rrd").returncode == 0
+    assert (
+        compare(one[0].path / "recording.rrd", different[0].path / "recording.rrd").returncode != 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -210,25 +200,9 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     assert (folder.path / "recording.rrd").read_text() == "precious"
 
 
-@pytest.fixture
-def server() -> Iterator[psutil.Popen]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [RERUN, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)]
-    process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    process.url = f"rerun+http://127.0.0.1:{port}/proxy"
-    while not RunningViewer(process.url).is_listening():
-        assert process.poll() is None
-        time.sleep(0.05)
-    yield process
-    process.kill()
-    process.wait()
-
-
 @pytest.mark.parametrize("fate", [None, signal.SIGSTOP, signal.SIGKILL])
 def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
-    fate: signal.Signals | None, server: psutil.Popen, tiny_run: TinyRun, tmp_path: Path
+    fate: signal.Signals | None, tiny_run: TinyRun, tmp_path: Path
 ) -> None:
     reference, summary = tiny_run(*FILE, "visual.every=1")
 
@@ -237,12 +211,13 @@ def test_a_viewer_is_shown_the_run_and_cannot_harm_it(
             time.sleep(0.01)
         server.send_signal(fate)
 
-    if fate is not None:
-        threading.Thread(target=strike).start()
-    live = ["visual=connect", f"visual.viewer.url={server.url}", "visual.samples=16"]
-    folder, watched = tiny_run(*live, "visual.every=1")
+    with viewer_server() as (port, server):
+        if fate is not None:
+            threading.Thread(target=strike).start()
+        url = f"visual.viewer.url=rerun+http://127.0.0.1:{port}/proxy"
+        folder, watched = tiny_run("visual=connect", url, "visual.samples=16", "visual.every=1")
     assert watched["return_mean"] == summary["return_mean"]
-    assert compare(folder, reference) == 0
+    assert compare(folder.path / "recording.rrd", reference.path / "recording.rrd").returncode == 0
 
 
 def episode_of(folder: RunFolder, number: int, deterministic: bool) -> list[TensorDictBase]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import RenameTransform, TransformedEnv
 
 from cnfp_torchrl import Ball, GeometryTransform, constrain_env, make_constrained_actor
 from cnfp_torchrl.configuration import compose_config, foreign_packages
@@ -93,6 +94,11 @@ class AsBefore(GeometryTransform):
         return Ball(center, torch.full_like(center[..., 0], 0.2), validate_args=False)
 
 
+class Nested(AsBefore):
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        return super().constraint_set(tensordict["far"])
+
+
 def test_what_only_constraints_read_is_asked_for() -> None:
     env = constrain_env(PointNavEnv([1]), AsBefore("ball", in_keys=["cost"]))
     actor = make_constrained_actor(gaussian_network(5, 2, hidden=[4]), env)
@@ -103,6 +109,29 @@ def test_what_only_constraints_read_is_asked_for() -> None:
     assert (action - 0.1 * cost).norm() <= 0.2
     with pytest.raises(ValueError, match="a mapping with the entries"):
         policy(observation)
+    for wrong in ("nonsense", ["a", "b"], object()):
+        with pytest.raises(TypeError, match="'cost': expected an array or a tensor of numbers"):
+            policy({"observation": observation, "cost": wrong})
+
+
+def test_nested_entries_are_taken_as_gymnasium_nests_them() -> None:
+    nested = RenameTransform(["cost"], [("far", "cost")])
+    env = constrain_env(TransformedEnv(PointNavEnv([1]), nested), Nested("ball", [["far", "cost"]]))
+    actor = make_constrained_actor(gaussian_network(5, 2, hidden=[4]), env)
+    policy = TrainedPolicy(actor, env)
+    assert policy.in_keys == [("far", "cost"), "observation"]
+    cost, observation = torch.ones(2), torch.zeros(5)
+    action = policy({"observation": observation, "far": {"cost": cost}})
+    same = policy({"observation": observation, ("far", "cost"): cost})
+    assert torch.equal(action, same)
+    with pytest.raises(ValueError, match=r"\('far', 'cost'\) is missing"):
+        policy({"observation": observation, "far": cost})
+
+
+@pytest.mark.parametrize("given", [None, 3])
+def test_a_run_is_a_path(given: object) -> None:
+    with pytest.raises(TypeError, match=f"run: expected the path of a run's folder, given {given}"):
+        load_policy(given)  # type: ignore[arg-type]
 
 
 def test_the_summary_says_where_the_run_came_from(run: RunFolder) -> None:

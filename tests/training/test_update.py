@@ -1,6 +1,6 @@
 """One step of learning: what it changes, that nothing waits for a GPU, and that it compiles."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,13 +89,6 @@ def test_a_step_on_a_gpu_does_not_synchronize(experiment: str) -> None:
 
 
 # Compiled -----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def fresh_compiler() -> Iterator[None]:
-    torch.compiler.reset()
-    yield
-    torch.compiler.reset()
 
 
 def stepped(make: Callable[[], tuple[Update, TensorDictReplayBuffer]]) -> dict[str, Tensor]:

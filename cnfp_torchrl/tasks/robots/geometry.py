@@ -139,7 +139,7 @@ class RateLimit(GeometryTransform):
     ) -> None:
         if not all(0 < limit < float("inf") for limit in limits):
             raise ValueError(f"{name}.limits: expected numbers > 0, given {list(limits)}")
-        super().__init__(name, [key or self.usual_key], **kwargs)
+        super().__init__(name, [key], **kwargs)
         self.register_buffer("limits", torch.tensor(list(limits)))
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:

@@ -4,6 +4,7 @@ The re-implementation is written from the task's table, computes positions in fl
 environment does, and decides every comparison in rational arithmetic.
 """
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv
 from cnfp_torchrl.tasks.point_nav.dynamics import Collision
 from cnfp_torchrl.tasks.point_nav.indicators import segment_touches_rectangle
+from tests.layouts import NONE, THREE
 
 F32 = np.float32
 DYADIC = Layout(
@@ -24,11 +26,12 @@ DYADIC = Layout(
     zone_radius=0.125,
     goal_radius=0.125,
 )
-THREE = Layout(
-    rectangles=((-0.6, -0.6, -0.2, 0.1), (0.1, -0.2, 0.6, 0.3), (-0.4, 0.4, 0.5, 0.6)),
-    battery_start=(21, 30),
-)
-LAYOUTS = {"reference": Layout(), "none": Layout(rectangles=()), "three": THREE, "dyadic": DYADIC}
+LAYOUTS = {
+    "reference": Layout(),
+    "none": NONE,
+    "three": replace(THREE, battery_start=(21, 30)),
+    "dyadic": DYADIC,
+}
 
 
 def exact(value: float) -> Fraction:

@@ -11,11 +11,9 @@ from torchrl.modules import RandomPolicy
 
 from cnfp_torchrl.envs import ConstraintCost
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
+from tests.layouts import NONE, THREE
 
-THREE = Layout(
-    rectangles=((-0.6, -0.6, -0.2, 0.1), (0.1, -0.2, 0.6, 0.3), (-0.4, 0.4, 0.5, 0.6)),
-)
-LAYOUTS = {"reference": Layout(), "none": Layout(rectangles=()), "three": THREE}
+LAYOUTS = {"reference": Layout(), "none": NONE, "three": THREE}
 
 
 def with_transforms(env: PointNavEnv) -> TransformedEnv:

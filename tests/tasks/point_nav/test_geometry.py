@@ -1,5 +1,7 @@
 """The sets of point navigation: sound, forward-invariant, and honest where nothing helps."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -16,27 +18,14 @@ from cnfp_torchrl.tasks.point_nav import (
     VisibleObstacleGeometry,
 )
 from cnfp_torchrl.tasks.point_nav.geometry import read_observation
+from tests.layouts import MAZE, NONE, THREE
 
 BOUNDS = Box(torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0]))
 LAYOUTS = {
     "reference": Layout(),
-    "none": Layout(rectangles=()),
-    "three": Layout(
-        rectangles=((-0.6, -0.6, -0.2, 0.1), (0.1, -0.2, 0.6, 0.3), (-0.4, 0.4, 0.5, 0.6)),
-        stations=((-0.9, -0.9), (0.9, 0.9)),
-        battery_start=(75, 100),
-    ),
-    "maze": Layout(
-        rectangles=(
-            (-0.8, -0.7, -0.7, 0.9),
-            (-0.5, -0.9, -0.4, 0.8),
-            (-0.2, -0.8, -0.1, 0.9),
-            (0.1, -0.5, 0.7, -0.4),
-            (0.35, -0.2, 0.9, 0.9),
-        ),
-        stations=((-0.9, -0.9), (0.0, 0.95)),
-        battery_start=(85, 100),
-    ),
+    "none": NONE,
+    "three": replace(THREE, stations=((-0.9, -0.9), (0.9, 0.9)), battery_start=(75, 100)),
+    "maze": replace(MAZE, battery_start=(85, 100)),
 }
 
 

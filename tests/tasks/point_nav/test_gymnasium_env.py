@@ -16,13 +16,10 @@ from cnfp_torchrl.tasks.point_nav import (
     PointNavEnv,
     render_point_nav,
 )
-
-THREE = Layout(
-    rectangles=((-0.6, -0.6, -0.2, 0.1), (0.1, -0.2, 0.6, 0.3), (-0.4, 0.4, 0.5, 0.6)),
-)
+from tests.layouts import NONE, THREE
 
 
-@pytest.mark.parametrize("layout", [None, Layout(rectangles=()), THREE])
+@pytest.mark.parametrize("layout", [None, NONE, THREE])
 def test_gymnasium_checker(layout: Layout | None) -> None:
     check_env(gymnasium.make(POINT_NAV_ID, layout=layout, render_mode="rgb_array").unwrapped)
 

@@ -6,17 +6,7 @@ import torch
 from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv, ShortestPath
 from cnfp_torchrl.tasks.point_nav.indicators import segment_touches_rectangle
 from cnfp_torchrl.tasks.point_nav.shortest_path import visible
-
-MAZE = Layout(
-    rectangles=(
-        (-0.8, -0.7, -0.7, 0.9),
-        (-0.5, -0.9, -0.4, 0.8),
-        (-0.2, -0.8, -0.1, 0.9),
-        (0.1, -0.5, 0.7, -0.4),
-        (0.35, -0.2, 0.9, 0.9),
-    ),
-    stations=((-0.9, -0.9), (0.0, 0.95)),
-)
+from tests.layouts import MAZE, NONE
 
 
 def test_on_the_reference_layout_the_waypoint_is_the_nearest_station() -> None:
@@ -49,7 +39,7 @@ def test_the_way_to_a_station_is_free_and_every_move_along_it_gains(layout: Layo
     assert (left < 1e-6).all()
 
 
-@pytest.mark.parametrize("layout", [Layout(), Layout(rectangles=()), MAZE])
+@pytest.mark.parametrize("layout", [Layout(), NONE, MAZE])
 def test_following_waypoints_reaches_goals_without_a_collision(layout: Layout) -> None:
     env = PointNavEnv((300,), layout=layout, seed=0, max_steps=10**9)
     path = ShortestPath(layout)

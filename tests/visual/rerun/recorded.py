@@ -1,13 +1,14 @@
-"""Recordings of made-up steps, and their content read back."""
+"""Recordings of made-up steps, their content read back, and a server that shows them."""
 
 import subprocess
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import rerun as rr
-import rerun_cli
 import torch
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
@@ -16,9 +17,11 @@ from tensordict import TensorDictBase
 from cnfp_torchrl.geometry import ConstraintSet
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.visual.rerun import FlowStream, flow_blueprint
+from cnfp_torchrl.visual.rerun.follow import is_listening
+from cnfp_torchrl.visual.rerun.viewers import LOOPBACK, executable, free_port
 from tests.visual.cases import make_actor, make_state
 
-RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+RERUN = executable()
 
 
 @contextmanager
@@ -94,3 +97,19 @@ def compare(one: Path, other: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [RERUN, "rrd", "compare", str(one), str(other)], capture_output=True, text=True, check=False
     )
+
+
+@contextmanager
+def viewer_server() -> Iterator[tuple[int, psutil.Popen]]:
+    """Start a viewer's server, the real program without its window; give its port and process."""
+    port = free_port()
+    command = [RERUN, "--serve-grpc", "--bind", LOOPBACK, "--port", str(port)]
+    server = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not is_listening((LOOPBACK, port)):
+            assert server.poll() is None
+            time.sleep(0.05)
+        yield port, server
+    finally:
+        server.kill()
+        server.wait()

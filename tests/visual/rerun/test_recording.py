@@ -24,8 +24,9 @@ from cnfp_torchrl.visual.rerun.viewers import (
     Viewer,
     ViewerWindow,
     WebViewer,
+    free_port,
 )
-from tests.visual.rerun.recorded import RERUN, read
+from tests.visual.rerun.recorded import RERUN, read, viewer_server
 
 PATIENCE_S = 60.0
 """After which a test has failed. Nothing takes as long by itself, but the machine may be busy."""
@@ -34,12 +35,6 @@ needs_vulkan = pytest.mark.skipif(
     not any(list(Path(folder).glob("*.json")) for folder in DRIVERS if Path(folder).is_dir()),
     reason="no Vulkan driver; on Debian: apt-get install mesa-vulkan-drivers",
 )
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def url(port: int) -> str:
@@ -66,14 +61,8 @@ def logged(path: Path) -> list[int]:
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Where a viewer's server listens: the real program, without its window."""
-    number = free_port()
-    command = [RERUN, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(number)]
-    server = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    until(lambda: RunningViewer(url(number)).is_listening())
-    yield number
-    server.kill()
-    server.wait()
+    with viewer_server() as (number, _):
+        yield number
 
 
 def server_of(port: int) -> psutil.Process:

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from cnfp_torchrl import constrain_env
 from cnfp_torchrl.geometry import ConstraintSet
-from cnfp_torchrl.modules import ProjectionFlow, make_constrained_actor
+from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
@@ -261,11 +261,6 @@ def test_bad_arguments_are_refused(case: str) -> None:
     arguments, dim, message = ARGUMENTS[case]
     with pytest.raises(ValueError, match=message):
         FlowStream(rr.RecordingStream("tests"), make_actor({}, dim=dim), **arguments)
-
-
-def test_flow_without_density_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"a flow with a density.*given ProjectionFlow"):
-        FlowStream(rr.RecordingStream("tests"), make_actor(PLANE, ProjectionFlow()))
 
 
 def test_batch_of_steps_is_refused() -> None:
