@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -49,7 +50,10 @@ def _gave_way(reports: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 @hydra_command("evaluate")
 def main(config: DictConfig) -> None:
-    """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to."""
+    """Evaluate a run, print a table, write ``evaluation.json``, and show episodes if asked to.
+
+    The last line names the recording, where there is one.
+    """
     require_settings(config)
     settings: EvaluationSettings = instantiate(config.evaluation)
     visual: CallbackFactory | None = instantiate(config.visual, _convert_="all") or None
@@ -57,8 +61,8 @@ def main(config: DictConfig) -> None:
     folder = RunFolder.open(config.run, config.checkpoint)
     directory = Path(HydraConfig.get().runtime.output_dir)
     stream: AbstractContextManager[Any] = nullcontext()
+    recording = directory / RECORDING
     if visual is not None:
-        recording = directory / RECORDING
         stream = closing(show_episodes(folder, settings, visual, recording, trusted=trusted))
     with stream:
         reports = evaluate_run(folder, settings, trusted=trusted)
@@ -73,6 +77,8 @@ def main(config: DictConfig) -> None:
             },
         )
         sys.stdout.write(f"{evaluation_table(reports)}\n{output}\n")
+    if recording.exists():
+        sys.stdout.write(f"next: cnfp-view {shlex.quote(str(recording))}\n")
 
 
 if __name__ == "__main__":
