@@ -1,6 +1,7 @@
 """The commands, each in a process of its own."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,8 @@ def test_sweeps_put_each_run_in_a_folder_of_its_own(tmp_path: Path) -> None:
         json.loads(path.read_text()) for path in tmp_path.glob("multirun/*/*/*/summary.json")
     ]
     jobs = {(summary["seed"], summary["flow"]) for summary in summaries}
+    command = shlex.join(["cnfp-train", "-m", "seed=0,1", "flow=exact,squash", *TINY])
+    assert {summary["command"] for summary in summaries} == {command}
     assert jobs == {(seed, flow) for seed in (0, 1) for flow in ("ExactFlow", "SquashFlow")}
 
 

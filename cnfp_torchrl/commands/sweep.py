@@ -113,11 +113,15 @@ def resume(
     """
 
     def go_on(run: SweepRun) -> str:
-        path = quoted(str(run.path.absolute()))
+        path = run.path.absolute()
         if RunFolder(run.path).has_started:
             arguments = [f"resume={path}", f"trusted=[{','.join(map(quoted, trusted))}]"]
         else:
-            arguments = [*config_arguments(folder), *run.given, f"hydra.run.dir={path}"]
+            arguments = [
+                *config_arguments(folder),
+                *run.given,
+                f"hydra.run.dir={quoted(str(path))}",
+            ]
         done = subprocess.run(
             [sys.executable, "-m", "cnfp_torchrl.commands.train", *arguments],
             stdout=subprocess.DEVNULL,

@@ -32,6 +32,7 @@ with needs_extra("train"):
     from cnfp_torchrl.training.callbacks import RECORDING
     from cnfp_torchrl.training.constraint_counts import NOT_COUNTED, count_text, gave_way_text
     from cnfp_torchrl.training.interruption import TrainingInterrupted
+    from cnfp_torchrl.training.provenance import remember_command
     from cnfp_torchrl.training.resume import resumed_config
     from cnfp_torchrl.training.run_folder import RunFolder
     from cnfp_torchrl.training.sweep import read_sweep
@@ -114,12 +115,21 @@ def _folder_and_config(config: DictConfig) -> tuple[RunFolder, DictConfig]:
     overrides = hydra_config.overrides.task
     # Slurm starts a job that was preempted, or ran out of time, once more and in the same way.
     if int(os.environ.get("SLURM_RESTART_COUNT", "0")) and RunFolder(output).has_started:
+        folder = RunFolder.resume(output)
+        if OmegaConf.to_container(config, resolve=True) == folder.load_settings():
+            return folder, config  # of this very command, whose own packages need no trust
+        folder.close()
         resumed, overrides = output, []
     if resumed is not None:
         folder = RunFolder.resume(resumed)
         return folder, resumed_config(folder, config, overrides, config.trusted)
     folder = RunFolder.create(output)
-    _save_hydra_files(folder, config)
+    try:
+        with folder.naming_what_cannot_be_written():
+            _save_hydra_files(folder, config)
+    except OSError:
+        _remove_unless_started(folder)
+        raise
     return folder, config
 
 
@@ -188,6 +198,7 @@ def _draw_figures(draw: Callable[[RunFolder], object], folder: RunFolder) -> Non
 
 def main() -> None:
     """Train a run, or the runs of a sweep, of which a table is printed at the end."""
+    remember_command("cnfp-train")
     sys.argv[1:] = with_common_keys(sys.argv[1:])
     try:
         _main()

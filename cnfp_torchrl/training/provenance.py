@@ -17,6 +17,14 @@ from cnfp_torchrl.installed_versions import installed_versions
 _PACKAGES = ("cnfp_torchrl", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco")
 
 
+_COMMAND = "CNFP_TORCHRL_COMMAND"
+
+
+def remember_command(name: str) -> None:
+    """Remember the command as it was given, before Hydra's quotes, and for all its processes."""
+    os.environ[_COMMAND] = shlex.join([name, *sys.argv[1:]])
+
+
 def provenance(device: str) -> dict[str, Any]:
     """Return versions, the commit of the source if there is one, the command and the machine.
 
@@ -33,7 +41,7 @@ def provenance(device: str) -> dict[str, Any]:
     return {
         "versions": {"python": platform.python_version(), **installed_versions(_PACKAGES)},
         "commit": _commit(Path(__file__).parent),
-        "command": shlex.join(sys.argv),
+        "command": os.environ.get(_COMMAND) or shlex.join(["python", *sys.orig_argv[1:]]),
         "machine": machine,
     }
 

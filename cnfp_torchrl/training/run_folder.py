@@ -311,9 +311,15 @@ class RunFolder:
         except OSError as error:
             if error.errno not in _OF_THE_DISK:
                 raise
+            failed = f"{self.path}: could not be written to ({error})"
+            remedy = "room, or the folder writable, and"
+            if not self.has_started:
+                raise CheckpointError(
+                    f"{failed}; the run has not begun. Make {remedy} begin it again"
+                ) from error
             raise CheckpointError(
-                f"{self.path}: could not be written to ({error}); the states in it are whole. Make "
-                f"room, or the folder writable, and go on with: {self._resuming()}"
+                f"{failed}; the states in it are whole. Make {remedy} go on with: "
+                f"{self._resuming()}"
             ) from error
 
     def _resuming(self) -> str:

@@ -252,7 +252,13 @@ def test_a_run_of_version_0_1_is_refused_as_such(trusted: tuple[str, ...], tmp_p
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
 def test_a_disk_that_ends_a_run_is_told_with_the_folder(number: int, tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "my run")
+    folder = RunFolder.create(tmp_path / "my run")
+    with (
+        pytest.raises(CheckpointError, match=r"my run: could not .*the run has not begun"),
+        folder.naming_what_cannot_be_written(),
+    ):
+        raise OSError(number, os.strerror(number))
+    (folder.path / "config.yaml").touch()
     with (
         pytest.raises(CheckpointError, match=r"my run: could not .*resume='.*my run'"),
         folder.naming_what_cannot_be_written(),
