@@ -35,7 +35,7 @@ with needs_extra("train"):
     from cnfp_torchrl.training.provenance import remember_command
     from cnfp_torchrl.training.resume import resumed_config
     from cnfp_torchrl.training.run_folder import RunFolder
-    from cnfp_torchrl.training.sweep import read_sweep
+    from cnfp_torchrl.training.sweep import read_sweep, run_folders
     from cnfp_torchrl.training.train import train
     from cnfp_torchrl.whole_file import whole_file
 
@@ -206,9 +206,10 @@ def main() -> None:
         sys.stderr.write(f"{stop}\n")
         sys.exit(128 + stop.number)
     finally:
-        # Also after a run that failed, which is why the others are worth a look.
+        # Also after a run that failed, which is why the others are worth a look; but not where the
+        # launcher was refused before the first.
         for sweep in STARTED:
-            if sweep.is_dir() and any(sweep.iterdir()):
+            if run_folders(sweep):
                 sys.stdout.write(f"{report(sweep)}\n")
         STARTED.clear()
 

@@ -99,6 +99,13 @@ class Mean:
         return cls(mean, float(stats.t.ppf(0.975, count - 1)) * error)
 
 
+def run_folders(folder: Path) -> set[Path]:
+    """Return the folders of a sweep's runs that were begun; none for a folder that is not there."""
+    found = {path.parent.parent for path in folder.glob(f"**/{OVERRIDES}")}
+    configured = {path.parent for path in folder.glob(f"**/{CONFIG}")}
+    return found | {path for path in configured if path.name != ".hydra"}
+
+
 def read_sweep(folder: Path, planned: Mapping[Path, Sequence[str]] | None = None) -> list[SweepRun]:
     """Return the runs in a folder, in the order of their numbers.
 
@@ -110,8 +117,7 @@ def read_sweep(folder: Path, planned: Mapping[Path, Sequence[str]] | None = None
     Raises:
         FileNotFoundError: when there is none.
     """
-    found = {path.parent.parent for path in folder.glob(f"**/{OVERRIDES}")}
-    found |= {path.parent for path in folder.glob(f"**/{CONFIG}") if path.parent.name != ".hydra"}
+    found = run_folders(folder)
     if not found:
         raise FileNotFoundError(
             f"folder: expected that of a sweep, given {folder}, which holds no run; give the one "

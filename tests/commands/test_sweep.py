@@ -58,6 +58,14 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert RunFolder(sweep / first["folder"]).load_failure() is not None
 
 
+def test_a_launcher_that_is_refused_before_the_first_run_is_explained(tmp_path: Path) -> None:
+    wrong = ["hydra/launcher=submitit_local", "+hydra.launcher.partition=none"]
+    done = run_command(tmp_path, "cnfp-train", "-m", *TINY, "seed=0,1", *wrong)
+    assert done.returncode == 1
+    assert "partition" in done.stderr.partition("\n")[0]
+    assert "holds no run" not in done.stderr
+
+
 @pytest.fixture(scope="module")
 def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a sweep over three seeds, one after another."""
