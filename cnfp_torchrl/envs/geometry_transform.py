@@ -266,7 +266,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.is_published_by_another:
             return next_tensordict
-        allowed, _ = self.publish(next_tensordict)
+        allowed, _ = self.write_set(next_tensordict)
         if self.validate:
             check = self.check(next_tensordict, allowed)
             found = evidence([check])
@@ -278,7 +278,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             self._is_compared = True
         return next_tensordict
 
-    def publish(
+    def write_set(
         self, states: TensorDictBase
     ) -> tuple[ConstraintSet, dict[tuple[str, ...], Tensor]]:
         """Write the set of some states, and a safe action if there is one, into them.

@@ -111,7 +111,7 @@ class StepGeometry:
         """Publish the sets, begin to look for the anchor, and return what is to be checked."""
         known, checks, published = {}, [], {}
         for geometry in self.geometries:
-            allowed, entries = geometry.publish(states)
+            allowed, entries = geometry.write_set(states)
             known[geometry.name] = allowed
             published.update(entries)
             if geometry.validate:

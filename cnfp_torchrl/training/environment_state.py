@@ -34,7 +34,19 @@ class CollectorState:
     @property
     def resumes_episodes(self) -> bool:
         """Tell whether the running episodes can be gone on with."""
-        return hasattr(self._collector, "_carrier") and environment_state(self._env) is not None
+        return self.why_episodes_begin_anew is None
+
+    @property
+    def why_episodes_begin_anew(self) -> str | None:
+        """The reason why the running episodes cannot be gone on with, None where they can."""
+        if not hasattr(self._collector, "_carrier"):
+            return "those of a collector with workers are not saved"
+        if environment_state(self._env) is not None:
+            return None
+        bare = self._env
+        while isinstance(bare, TransformedEnv):
+            bare = bare.base_env
+        return f"{type(bare).__name__} does not give its state"
 
     def state_dict(self) -> dict[str, Any]:
         """Return counts, the environment's state, and the state that the policy acts in next."""

@@ -161,10 +161,9 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     if resume:
         callback.continue_at(metrics.frames)
         sys.stderr.write(f"{folder.path}: goes on at step {done}\n")
-        if done and not episodes.resumes_episodes:
+        if done and (reason := episodes.why_episodes_begin_anew):
             warnings.warn(
-                f"the episodes that ran at step {done} begin anew: {env.base_env} does not give "
-                "its state",
+                f"the episodes that ran at step {done} begin anew: {reason}",
                 EpisodesBeginAnewWarning,
                 stacklevel=3,
             )
