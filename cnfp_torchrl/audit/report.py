@@ -304,8 +304,8 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         yield "\n".join(f"note: {note}" for note in report.notes)
     yield from _examples(report)
     flaws = report.flaws
-    audited = f"; {', '.join(unjudged)}: not judged" if unjudged else ""
-    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else f"no flaw found{audited}"
+    not_judged = f"; {', '.join(unjudged)}: not judged" if unjudged else ""
+    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else f"no flaw found{not_judged}"
 
 
 def _examples(report: AuditReport) -> Iterator[str]:

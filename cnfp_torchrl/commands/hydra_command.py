@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from cnfp_torchrl.commands.paths import quoted_paths
 from cnfp_torchrl.commands.refusals import WITH_TRACEBACKS, errors_in_a_sentence, write_error
-from cnfp_torchrl.commands.side_by_side import begin_no_other, begin_run, is_side_by_side
+from cnfp_torchrl.commands.side_by_side import as_stop, begin_run, end_run, is_side_by_side
 from cnfp_torchrl.configuration import config_directory, refuse_unknown_settings
 from cnfp_torchrl.training.interruption import TrainingInterrupted
 
@@ -82,15 +82,24 @@ def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
             begin_run()
         refuse_unknown_settings(config)
         return function(config)
-    except (SystemExit, TrainingInterrupted) as stop:
+    except (SystemExit, TrainingInterrupted) as end:
         if not is_in_worker:
             raise
         # As a failure, for joblib would kill the others.
-        raise CompactHydraException(str(begin_no_other(stop))) from stop
+        left = RuntimeError(f"the run was left by sys.exit, with {end}")
+        raise CompactHydraException(str(as_stop(end) or _told(left))) from end
     except Exception as error:
-        folder = Path(HydraConfig.get().runtime.output_dir).name
         # Not the end of the process, which would be that of the sweep.
-        raise CompactHydraException(write_error(error, f"{folder}: ")) from error
+        raise CompactHydraException(_told(error)) from error
+    finally:
+        if is_in_worker:
+            end_run()
+
+
+def _told(error: Exception) -> str:
+    """Write why a run of a sweep fails, and return it."""
+    folder = Path(HydraConfig.get().runtime.output_dir).name
+    return write_error(error, f"{folder}: ")
 
 
 @contextmanager

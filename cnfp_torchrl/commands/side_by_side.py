@@ -7,6 +7,7 @@ worker dies, joblib kills the others at once, whatever they have not saved.
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 import time
@@ -43,17 +44,31 @@ def begin_run() -> None:
         signal.signal(number, _stop_run)
 
 
-def begin_no_other(reason: BaseException) -> TrainingInterrupted:
-    """Return why a worker's run was stopped, which is why it begins no further one."""
-    if not isinstance(reason, TrainingInterrupted):
-        reason = TrainingInterrupted(signal.SIGTERM, "stopped")
-    _stopped.append(reason)
-    return reason
+def end_run() -> None:
+    """Let signals alone keep this worker from further runs: joblib kills all when one dies."""
+    for number in STOP_SIGNALS:
+        signal.signal(number, _begin_no_other)
+
+
+def as_stop(reason: SystemExit | TrainingInterrupted) -> TrainingInterrupted | None:
+    """Return the signal that ended a worker's run, which then begins no further one; else None."""
+    if isinstance(reason, TrainingInterrupted):
+        stop = reason
+    elif reason.code in [128 + number for number in STOP_SIGNALS]:
+        stop = TrainingInterrupted(int(reason.code or 0) - 128, "stopped")
+    else:
+        return None
+    _stopped.append(stop)
+    return stop
+
+
+def _begin_no_other(number: int, frame: FrameType | None) -> None:
+    _stopped.append(TrainingInterrupted(number, "stopped"))
 
 
 def _stop_run(number: int, frame: FrameType | None) -> None:
-    """Stop a run that has not begun to save its states."""
-    raise TrainingInterrupted(number, "stopped before its first step")
+    """Stop a run that is not in training, where it would save its state first."""
+    raise TrainingInterrupted(number, "stopped outside of training")
 
 
 def stop_when_runs_are_saved(sweep: Path) -> None:
@@ -69,11 +84,13 @@ def stop_when_runs_are_saved(sweep: Path) -> None:
         sys.stderr.write(f"\n{name}: the sweep stops when its runs are saved; again: at once\n")
         for worker in active_children():
             # To those that a terminal or Slurm has told already, it counts as the same.
-            with suppress(ProcessLookupError):
-                os.kill(worker.pid or 0, number)
+            if worker.pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(worker.pid, number)
         while any(RunFolder(path.parent.parent).is_held for path in sweep.glob(f"**/{OVERRIDES}")):
             time.sleep(0.1)
-        raise TrainingInterrupted(number, f"stopped; go on with: cnfp-sweep {sweep} --resume")
+        command = f"cnfp-sweep {shlex.quote(str(sweep))} --resume"
+        raise TrainingInterrupted(number, f"stopped; go on with: {command}")
 
     for number in STOP_SIGNALS:
         signal.signal(number, stop)

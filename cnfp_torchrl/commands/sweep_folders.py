@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from itertools import product
@@ -14,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from cnfp_torchrl.commands.side_by_side import is_side_by_side, stop_when_runs_are_saved
 
@@ -35,10 +34,16 @@ class SweepStart(Callback):
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Remember the folder."""
+        """Remember the folder, and begin no more workers than runs."""
         STARTED.append(Path(str(config.hydra.sweep.dir)).absolute())
-        if is_side_by_side(config.hydra):
-            stop_when_runs_are_saved(STARTED[-1])
+        if not is_side_by_side(config.hydra):
+            return
+        stop_when_runs_are_saved(STARTED[-1])
+        # A worker that has no run would die of a signal, and joblib then kills those that save.
+        hydra: Any = OmegaConf.to_container(config.hydra)
+        if runs := _runs_of(hydra, STARTED[-1]):
+            with read_write(config), open_dict(config):
+                config.hydra.launcher.n_jobs = min(_processes(hydra), len(runs))
 
 
 def run_name(number: int, overrides: Sequence[str], constant: Sequence[str]) -> str:
@@ -80,7 +85,11 @@ def planned_runs(folder: Path) -> dict[Path, list[str]]:
     path = folder / MULTIRUN
     if not path.is_file():
         return {}
-    settings = yaml.safe_load(path.read_text(encoding="utf-8"))["hydra"]
+    return _runs_of(yaml.safe_load(path.read_text(encoding="utf-8"))["hydra"], folder)
+
+
+def _runs_of(settings: dict[str, Any], folder: Path) -> dict[Path, list[str]]:
+    """Return what `planned_runs` does, of Hydra's own settings."""
     if not settings["sweeper"]["_target_"].endswith(".BasicSweeper"):
         return {}
     always = [f"{key}={value}" for key, value in (settings["sweeper"]["params"] or {}).items()]
@@ -104,10 +113,14 @@ def planned_runs(folder: Path) -> dict[Path, list[str]]:
 
 def processes(folder: Path) -> int:
     """Return how many runs of a sweep that Hydra has started go side by side."""
-    settings = yaml.safe_load((folder / MULTIRUN).read_text(encoding="utf-8"))["hydra"]
-    given = int(settings["launcher"].get("n_jobs", 1))
-    # As joblib counts: -1 is one for each processor.
-    return given if given > 0 else max((os.cpu_count() or 1) + 1 + given, 1)
+    return _processes(yaml.safe_load((folder / MULTIRUN).read_text(encoding="utf-8"))["hydra"])
+
+
+def _processes(settings: dict[str, Any]) -> int:
+    from joblib import effective_n_jobs  # of the extra `sweep`, without which nothing is parallel
+
+    count: int = effective_n_jobs(settings["launcher"].get("n_jobs") or 1)
+    return count
 
 
 def config_arguments(folder: Path) -> list[str]:

@@ -136,16 +136,20 @@ def test_a_killed_process_takes_no_run_with_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_stops_runs_side_by_side_when_they_are_saved(number: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("jobs", "seeds"), [(2, "seed=0,1,2"), (4, "seed=0,1")])
+def test_a_signal_stops_runs_side_by_side_when_they_are_saved(
+    number: int, jobs: int, seeds: str, tmp_path: Path
+) -> None:
     sweep = tmp_path / "s"
     endless = ["collector.total_frames=1000000", "checkpoint.interval=48"]
-    process = begin_side_by_side(sweep, *endless, "hydra.launcher.n_jobs=2", "seed=0,1,2")
+    process = begin_side_by_side(sweep, *endless, f"hydra.launcher.n_jobs={jobs}", seeds)
     os.killpg(process.pid, number)
     _, told = process.communicate()
     assert process.returncode == 128 + number, told
     assert told.count("stopped and saved at step") == 2
-    states = [row["state"] for row in table(sweep)]
-    assert [state.partition(":")[0] for state in states] == ["stopped", "stopped", "not started"]
+    states = [row["state"].partition(":")[0] for row in table(sweep)]
+    assert states == ["stopped", "stopped", "not started"][: len(states)]
+    assert len(states) == seeds.count(",") + 1
 
 
 @pytest.mark.slow
