@@ -20,7 +20,7 @@ from torch import nn
 
 from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
 from cnfp_torchrl.training.checkpoints import CheckpointError, save_data
-from cnfp_torchrl.whole_file import whole_file, write_json
+from cnfp_torchrl.whole_file import remove_partial_files, whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
 FAILURE = "failure.json"
@@ -328,6 +328,11 @@ class RunFolder:
     def how_to_resume(self, frames: int) -> str:
         """Return a sentence for whoever stopped the run."""
         return f"stopped and saved at step {frames}; go on with: {self._resuming()}"
+
+    def remove_partial_files(self) -> None:
+        """Remove what is left of files that a run was writing when it was killed."""
+        for name in (CONFIG, CHECKPOINT, BEST, SUMMARY, FAILURE, f"{STATES}/*"):
+            remove_partial_files(self.path / name)
 
     def save_failure(self, error: BaseException) -> None:
         """Write why the run failed, as far as that can be written."""
