@@ -35,8 +35,11 @@ from cnfp_torchrl.envs.task_view import (
     ShowTask,
     StateSetter,
     TaskView,
+    action_components,
     environment_layers,
     find_task_view,
+    numbered_components,
+    require_names,
 )
 
 # Whoever has an environment in hand looks for these here.
@@ -67,6 +70,7 @@ __all__ = [
     "ShowTask",
     "StateSetter",
     "TaskView",
+    "action_components",
     "amounts_keys",
     "appended_transforms",
     "can_render",
@@ -77,5 +81,7 @@ __all__ = [
     "counted_constraints",
     "environment_layers",
     "find_task_view",
+    "numbered_components",
     "refuse_misnamed_judges",
+    "require_names",
 ]
