@@ -141,10 +141,16 @@ class RunFolder:
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
+            ValueError: for any other name of a checkpoint.
         """
+        if checkpoint not in (CHECKPOINT, BEST):
+            raise ValueError(
+                f"checkpoint: expected {CHECKPOINT}, the last policy, or {BEST}, the best one of "
+                f"training, given {checkpoint!r}"
+            )
         folder = cls(path, checkpoint)
         missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
-        if missing == [BEST]:
+        if missing == [BEST] and (folder.path / CHECKPOINT).is_file():
             raise FileNotFoundError(
                 f"checkpoint: expected {BEST} in {folder.path}, which has none, for no policy was "
                 f"scored in training without a violation; take the last one, {CHECKPOINT}"
