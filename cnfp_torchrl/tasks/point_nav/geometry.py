@@ -131,19 +131,6 @@ class ObstacleGeometry(PointNavGeometry):
     """
 
     usual_name = "obstacle"
-    _half: Tensor
-    _signs: Tensor
-
-    def __init__(
-        self,
-        layout: Layout | None = None,
-        name: str | None = None,
-        observation_key: str = "observation",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(layout, name, observation_key, **kwargs)
-        self.register_buffer("_half", torch.tensor(0.5), persistent=False)
-        self.register_buffer("_signs", torch.tensor([1.0, -1.0])[:, None, None], persistent=False)
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
@@ -159,8 +146,8 @@ class ObstacleGeometry(PointNavGeometry):
         # Of high bounds, then of low ones with their signs changed.
         room = ((rooms.amin(0) - MARGIN) / self.layout.step_length).view(2, 2, -1)
         bounds = room.clamp(-1, 1)
-        outwards = torch.where(room[:1] >= room[1:], _BEYOND + 0.5, -_BEYOND - 0.5)
-        outwards = torch.addcmul(self._half, self._signs, outwards)
+        outwards = torch.where(room[0] >= room[1], _BEYOND + 1, -_BEYOND)
+        outwards = torch.stack([outwards, 1 - outwards])
         bounds = torch.where(bounds.sum(0) <= 0, outwards, bounds)
         high, low = bounds.mT.reshape(2, *way.batch, 2).unbind()
         return Box(-low, high, validate_args=False)
