@@ -54,7 +54,6 @@ ROUNDS = 8
 
 SETTINGS = (
     "loss.gamma=0.99",
-    "loss.loss_function=smooth_l1",  # as the kept records; l2 learns Hopper faster, see the page
     "network.hidden=[256,256]",
     "optim.lr=3e-4",
     "replay_buffer.batch_size=256",
