@@ -62,15 +62,16 @@ class Recession(Bijector):
     refused there, or without checks its actions are NaN.
 
     Args:
-        region: regions of batch shape ``(*batch,)``. Without an anchor, all sets but the bounds
+        region: Regions of batch shape ``(*batch,)``. Without an anchor, all sets but the bounds
             must be half-spaces, and the bounds infinite.
-        way_out: vectors r of any length, ``(*batch, d)``; None takes the one with the largest
+        way_out: Vectors r of any length, ``(*batch, d)``; None takes the one with the largest
             margin to all rows, minus the point of least length in the hull of their unit normals.
-        scale: scale s of the softness, in action units; with ``of_latents`` in units of latents.
-        sharpness: sharpness of the soft retraction.
-        of_latents: whether arguments are in units of the bounds, from -1 to 1, as those of a
+        scale: The scale s of the softness, in action units; with ``of_latents`` in units of
+            latents.
+        sharpness: The sharpness of the soft retraction.
+        of_latents: Whether arguments are in units of the bounds, from -1 to 1, as those of a
             Gaussian policy are, and not in action units.
-        validate_args: whether to check bounds and ways out, which reads them on the host.
+        validate_args: Whether to check bounds and ways out, which reads them on the host.
 
     Raises:
         ValueError: when scale or sharpness are out of range.
@@ -233,15 +234,15 @@ class _Rows(NamedTuple):
     away than the action can be broken.
 
     Args:
-        normals: outward unit normals, ``(*batch, m, d)``.
-        offsets: offsets, ``(*batch, m)``; a large number for rows that do not count, since the
+        normals: Outward unit normals, ``(*batch, m, d)``.
+        offsets: Offsets, ``(*batch, m)``; a large number for rows that do not count, since the
             gradient of infinity would be NaN.
-        back: unit vectors -r, ``(*batch, d)``.
-        rates: how fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
-        stretch: how much longer the way is than it must be, as a share, ``(*batch,)``; NaN where
+        back: Unit vectors -r, ``(*batch, d)``.
+        rates: How fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
+        stretch: How much longer the way is than it must be, as a share, ``(*batch,)``; NaN where
             there is no way out and no anchor either.
-        has_way_out: where there is a way out, boolean ``(*batch,)``.
-        magnitude: the size of points that offsets are eroded for, ``(*batch, 1)``; None is 0.
+        has_way_out: Where there is a way out, boolean ``(*batch,)``.
+        magnitude: The size of points that offsets are eroded for, ``(*batch, 1)``; None is 0.
     """
 
     normals: Tensor
@@ -262,9 +263,9 @@ class _Rows(NamedTuple):
         """Return the rows of sets, each with where it is not dropped (None: everywhere).
 
         Args:
-            sets: half-spaces.
-            way_out: vectors r of any length, ``(*batch, d)``; None finds one.
-            magnitude: the size of points, ``(*batch,)``. None is 0, for a region without an anchor,
+            sets: Half-spaces.
+            way_out: Vectors r of any length, ``(*batch, d)``; None finds one.
+            magnitude: The size of points, ``(*batch,)``. None is 0, for a region without an anchor,
                 where actions are NaN if there is no way out, and not left as they are.
         """
         normals, offsets = _unit_rows(sets)
@@ -315,8 +316,8 @@ class _Rows(NamedTuple):
         """Return how far to go along the way out until all rows hold, negative if they do.
 
         Args:
-            point: points ``(*batch, d)``.
-            wished: the actions that rows are eroded for, ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
+            wished: The actions that rows are eroded for, ``(*batch, d)``.
         """
         size = wished.detach().abs().amax(-1, keepdim=True)
         if self.magnitude is not None:
@@ -367,8 +368,8 @@ def hull_point(normals: Tensor, binds: Tensor) -> Tensor:
     that decide. Where the hull contains 0 nothing leads away from all rows.
 
     Args:
-        normals: unit normals, ``(*batch, m, d)``.
-        binds: which rows count, boolean ``(*batch, m)``.
+        normals: Unit normals, ``(*batch, m, d)``.
+        binds: Which rows count, boolean ``(*batch, m)``.
     """
     if normals.shape[-2] <= 2:
         # The point of least length between two unit vectors is their middle.
@@ -392,8 +393,8 @@ def _deciding_rows(gram: Tensor, binds: Tensor) -> Tensor:
     that decide, and far below for the others.
 
     Args:
-        gram: products of all rows, ``(*batch, m, m)``.
-        binds: which rows count, boolean ``(*batch, m)``; rows that do not are zero.
+        gram: Products of all rows, ``(*batch, m, m)``.
+        binds: Which rows count, boolean ``(*batch, m)``; rows that do not are zero.
     """
     # A row that does not count would be the shortest point; it costs more than any other can.
     cost = torch.where(binds, 0.0, 4.0).to(gram.dtype)

@@ -64,8 +64,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         bijectors: One for each constraint; they know where the geometry lies.
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order. The same as the flow's.
-        leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
-            smallest width of the action bounds.
+        leeway: The amount by which relaxed constraints give way beyond the least amount, as a share
+            of the smallest width of the action bounds.
         compile: Whether the geometries right before this transform, their checks and the cheap part
             of the anchor are compiled into one function (`torch.compile`), which steps use; resets
             do without. `constraint_set` must then read the entries of its `in_keys` alone.

@@ -38,9 +38,9 @@ class Step(NamedTuple):
     """What is known of the anchors in some states before any search.
 
     Attributes:
-        begun: what a search goes on from; of a compiled pass without the sets.
-        is_decided: whether all states need no search.
-        is_published: whether it is published already that all constraints hold.
+        begun: What a search goes on from; of a compiled pass without the sets.
+        is_decided: Whether all states need no search.
+        is_published: Whether it is published already that all constraints hold.
     """
 
     begun: Begun

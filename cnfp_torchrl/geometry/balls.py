@@ -30,8 +30,8 @@ class Ball(ConstraintSet):
     r"""The ball :math:`\{a : |a - center| \le radius\}`.
 
     Args:
-        center: centers ``(*batch, d)``, finite.
-        radius: radii ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
+        center: Centers ``(*batch, d)``, finite.
+        radius: Radii ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -120,8 +120,8 @@ class Ellipsoid(ConstraintSet):
     r"""The ellipsoid :math:`\{m + T x : |x| \le 1\}` with T lower triangular.
 
     Args:
-        center: centers m, ``(*batch, d)``, finite.
-        scale_tril: matrices T, ``(*batch, d, d)``, zero above their positive diagonals.
+        center: Centers m, ``(*batch, d)``, finite.
+        scale_tril: Matrices T, ``(*batch, d, d)``, zero above their positive diagonals.
     """
 
     center: Tensor
@@ -240,9 +240,9 @@ class TaskSpaceBall(ConstraintSet):
     else none.
 
     Args:
-        jacobian: matrices J, ``(*batch, m, d)``, finite.
-        offset: vectors b, ``(*batch, m)``, finite.
-        radius: radii ``(*batch,)``, finite, 0 or more.
+        jacobian: Matrices J, ``(*batch, m, d)``, finite.
+        offset: Vectors b, ``(*batch, m)``, finite.
+        radius: Radii ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -345,9 +345,9 @@ def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None)
     never does. Computed in units of the radius, whose square may be out of range.
 
     Args:
-        offset: points minus the ball's center, w, ``(*batch, d)``, shorter than the radius.
-        radius: radii r, ``(*batch,)``.
-        unit: length in which directions are given, ``(*batch,)``; None means 1.
+        offset: Points minus the ball's center, w, ``(*batch, d)``, shorter than the radius.
+        radius: Radii r, ``(*batch,)``.
+        unit: The length in which directions are given, ``(*batch,)``; None means 1.
     """
     offset = offset / radius.unsqueeze(-1)
     distance = vector_norm(offset, dim=-1)

@@ -38,8 +38,8 @@ class Box(ConstraintSet):
     r"""The box :math:`\{a : low \le a \le high\}`; infinite bounds are allowed.
 
     Args:
-        low: lower bounds ``(*batch, d)``.
-        high: upper bounds ``(*batch, d)``, none less than its lower bound.
+        low: Lower bounds ``(*batch, d)``.
+        high: Upper bounds ``(*batch, d)``, none less than its lower bound.
     """
 
     low: Tensor
@@ -146,8 +146,8 @@ def require_action_bounds(bounds: Box, where: str = "action bounds") -> Box:
     Reads them on the host.
 
     Args:
-        bounds: box of all actions.
-        where: beginning of the message.
+        bounds: The box of all actions.
+        where: The beginning of the message.
 
     Raises:
         GeometryError: when a bound is not finite, or bounds are closer to each other than rounding
@@ -192,10 +192,10 @@ def gauge_of_sides(above: Tensor, below: Tensor, ahead: Tensor, behind: Tensor) 
     """Return the gauge of a box, ``(*batch,)``, at an offset from an anchor given by its `sides`.
 
     Args:
-        above: inverse distances from the anchor to the high bounds, ``(*batch, d)``.
-        below: inverse distances from the anchor to the low bounds, ``(*batch, d)``.
-        ahead: positive part of the offset, ``(*batch, d)``.
-        behind: negative part of the offset, ``(*batch, d)``.
+        above: Inverse distances from the anchor to the high bounds, ``(*batch, d)``.
+        below: Inverse distances from the anchor to the low bounds, ``(*batch, d)``.
+        ahead: The positive part of the offset, ``(*batch, d)``.
+        behind: The negative part of the offset, ``(*batch, d)``.
     """
     return torch.addcmul(ahead * above, behind, below).amax(-1)
 

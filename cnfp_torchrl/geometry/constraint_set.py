@@ -45,8 +45,8 @@ class Bounds(NamedTuple):
     """Lower and upper bounds of the components of actions.
 
     Args:
-        low: lower bounds ``(*batch, d)``, minus infinity where none is known.
-        high: upper bounds ``(*batch, d)``, infinity where none is known.
+        low: Lower bounds ``(*batch, d)``, minus infinity where none is known.
+        high: Upper bounds ``(*batch, d)``, infinity where none is known.
     """
 
     low: Tensor
@@ -57,8 +57,8 @@ class Evidence(NamedTuple):
     """A number of a batch of states that tells on which side of a limit all of them are.
 
     Args:
-        value: number or flag, ``()``.
-        limit: largest absolute value that is good; NaN never is.
+        value: The number or flag, ``()``.
+        limit: The largest absolute value that is good; NaN never is.
     """
 
     value: Tensor
@@ -138,8 +138,8 @@ class ConstraintSet(ABC):
         unbounded the gauge is 0.
 
         Args:
-            direction: vectors ``(*batch, d)``, none of them zero.
-            anchor: points strictly inside the set, ``(*batch, d)``; about others the result is
+            direction: Vectors ``(*batch, d)``, none of them zero.
+            anchor: Points strictly inside the set, ``(*batch, d)``; about others the result is
                 meaningless.
         """
 
@@ -151,7 +151,7 @@ class ConstraintSet(ABC):
         tolerance.
 
         Args:
-            magnitude: largest coordinate of the points, ``(*batch,)``.
+            magnitude: The largest coordinate of the points, ``(*batch,)``.
         """
 
     @abstractmethod
@@ -161,8 +161,8 @@ class ConstraintSet(ABC):
         It takes the place of a dropped set, with a ball that contains the action bounds.
 
         Args:
-            center: center of the ball, ``(*batch, d)``.
-            radius: radius of the ball, ``(*batch,)``, positive.
+            center: The center of the ball, ``(*batch, d)``.
+            radius: The radius of the ball, ``(*batch,)``, positive.
         """
 
     def inflated(self, by: Tensor) -> Self:
@@ -172,7 +172,7 @@ class ConstraintSet(ABC):
         cannot hold they are dropped.
 
         Args:
-            by: amounts in units of the slack, finite, 0 or more: ``(*batch, m)`` for the m rows of
+            by: Amounts in units of the slack, finite, 0 or more: ``(*batch, m)`` for the m rows of
                 `row_slacks`, or ``(*batch, 1)`` for all rows alike.
 
         Raises:
@@ -216,7 +216,7 @@ class ConstraintSet(ABC):
         """Return the gauge about an anchor, with all that directions share computed once.
 
         Args:
-            anchor: points strictly inside the set, ``(*batch, d)``.
+            anchor: Points strictly inside the set, ``(*batch, d)``.
         """
         return partial(_gauge_at, self, anchor)
 
@@ -267,7 +267,7 @@ class ConstraintSet(ABC):
         Only non-convex families override this: a convex set is its own and only part.
 
         Args:
-            point: points ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
         """
         return self.superlevel()
 
@@ -278,7 +278,7 @@ class ConstraintSet(ABC):
         set is convex.
 
         Args:
-            point: points ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
 
         Returns:
             A description of batch shape ``(parts, *batch)``.
@@ -348,9 +348,9 @@ class ConstraintSet(ABC):
         """Return the set where it is active, and elsewhere one of its family that contains a ball.
 
         Args:
-            active: flags of the states in which the set stays, boolean ``(*batch,)``.
-            center: center of the ball, ``(*batch, d)``.
-            radius: radius of the ball, ``(*batch,)``.
+            active: Flags of the states in which the set stays, boolean ``(*batch,)``.
+            center: The center of the ball, ``(*batch, d)``.
+            radius: The radius of the ball, ``(*batch,)``.
         """
         return self.where(active, self.around(center, radius))
 
@@ -358,7 +358,7 @@ class ConstraintSet(ABC):
         """Return the set itself, or refuse it. Compiled and exported programs check shapes alone.
 
         Args:
-            name: name of the constraint, for the message.
+            name: The name of the constraint, for the message.
 
         Raises:
             GeometryError: naming constraint, field, batch index, the expected and the given.
@@ -397,7 +397,7 @@ class ConstraintSet(ABC):
         """Refuse fields of wrong types or shapes, without reading their values.
 
         Args:
-            where: beginning of the message.
+            where: The beginning of the message.
 
         Raises:
             GeometryError: naming the field, the expected and the given.

@@ -32,8 +32,8 @@ class HalfSpaces(ConstraintSet):
     offset where the normal is zero.
 
     Args:
-        normals: outward normals of the rows, ``(*batch, m, d)``, finite.
-        offsets: offsets of the rows, ``(*batch, m)``; infinite ones let every action pass.
+        normals: Outward normals of the rows, ``(*batch, m, d)``, finite.
+        offsets: Offsets of the rows, ``(*batch, m)``; infinite ones let every action pass.
     """
 
     normals: Tensor

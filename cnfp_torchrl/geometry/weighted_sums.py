@@ -28,8 +28,8 @@ class KinkedSumBound(ConstraintSet):
     A family derives :math:`\alpha_i \ge 0 \ge \beta_i` from its weights. The set contains 0.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     weights: Tensor
@@ -141,8 +141,8 @@ class WeightedL1Ball(KinkedSumBound):
     With joint velocities as weights and torques as actions it limits the power of all joints.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod
@@ -165,8 +165,8 @@ class PositivePart(KinkedSumBound):
     draw; power that they return does not count.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod

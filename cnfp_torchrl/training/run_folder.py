@@ -36,8 +36,8 @@ class RunFolder:
     """The folder of one training run: configuration, checkpoint, summary, metrics and figures.
 
     Args:
-        path: the folder.
-        checkpoint: name of the file that policies are read from.
+        path: The folder.
+        checkpoint: The name of the file that policies are read from.
     """
 
     def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
@@ -136,8 +136,8 @@ class RunFolder:
         """Return the folder of a finished run.
 
         Args:
-            path: the folder.
-            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
+            path: The folder.
+            checkpoint: The name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
@@ -191,7 +191,7 @@ class RunFolder:
         Sections of training alone, such as the optimizer's, are left out; `load_settings` has them.
 
         Args:
-            trusted: packages, modules or objects that may be named beside what the shipped
+            trusted: Packages, modules or objects that may be named beside what the shipped
                 configuration names, such as ``my_package.envs.``.
 
         Raises:
@@ -211,7 +211,7 @@ class RunFolder:
         """Read what the run can be trained further from: all of its configuration.
 
         Args:
-            trusted: see `load_config`.
+            trusted: See `load_config`.
 
         Raises:
             ValueError: as `load_config`.

@@ -43,10 +43,10 @@ class Case:
     """An intersection, and how exactly it is projected onto.
 
     Args:
-        name: id of the test.
-        sets: sets to intersect, the first the box of action bounds.
-        rounds: number of rounds of Dykstra's algorithm.
-        error: largest distance to SciPy's solution, which itself is good to 2e-6.
+        name: The id of the test.
+        sets: Sets to intersect, the first the box of action bounds.
+        rounds: The number of rounds of Dykstra's algorithm.
+        error: The largest distance to SciPy's solution, which itself is good to 2e-6.
     """
 
     name: str

@@ -39,8 +39,8 @@ def attempt_anchor(
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds.
-        candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        steps: number of steps inwards, 0 or more.
+        candidate: Points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
+        steps: The number of steps inwards, 0 or more.
 
     Returns:
         Points ``(*batch, d)``, and the flags of those that are anchors, boolean ``(*batch,)``: they
@@ -138,8 +138,8 @@ def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
-        sets: sets of batch shapes that broadcast.
-        before: attempt to start from, ``(*batch,)``.
+        sets: Sets of batch shapes that broadcast.
+        before: The attempt to start from, ``(*batch,)``.
 
     Returns:
         The attempts in all states, side by side.

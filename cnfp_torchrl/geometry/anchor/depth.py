@@ -64,7 +64,7 @@ def row_depths(sets: Sequence[ConstraintSet]) -> list[Tensor]:
     width is that of the action bounds, the erosion what `ConstraintSet.eroded` takes off the row.
 
     Args:
-        sets: sets, the first of them the box of action bounds.
+        sets: Sets, the first of them the box of action bounds.
     """
     bounds = bounds_of(sets)
     least = (DEPTH * bounds.smallest_width()).unsqueeze(-1)

@@ -50,8 +50,8 @@ class Begun(NamedTuple):
     """The rule after its cheapest attempts, which decide many states.
 
     Attributes:
-        sets: sets in order of application.
-        attempt: points, and whether they are anchors.
+        sets: Sets in order of application.
+        attempt: Points, and whether they are anchors.
     """
 
     sets: Sequence[ConstraintSet]
@@ -70,8 +70,8 @@ def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None)
     """Make the attempts that take the least time, and read no tensor on the host.
 
     Args:
-        sets: sets in order of application, as in `lexicographic_anchor`.
-        candidate: points that may lie in all sets, ``(*batch, d)``.
+        sets: Sets in order of application, as in `lexicographic_anchor`.
+        candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
     return Begun(sets, first_attempt(sets, candidate))
 
@@ -92,8 +92,8 @@ def lexicographic_anchor(
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
             which always holds, and the last has the highest priority.
-        candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        leeway: amount by which rows are relaxed beyond the least one, as a share of the bounds'
+        candidate: Points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
+        leeway: The amount by which rows are relaxed beyond the least one, as a share of the bounds'
             smallest width; positive.
 
     Raises:
@@ -109,8 +109,8 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
     """Take steps inwards and search in the states that are not decided yet.
 
     Args:
-        begun: what `begin_anchor` returned.
-        leeway: leeway, as in `lexicographic_anchor`.
+        begun: What `begin_anchor` returned.
+        leeway: Leeway, as in `lexicographic_anchor`.
     """
     if not leeway > 0:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
@@ -151,8 +151,8 @@ def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> T
     this much at most. A larger relaxation means that a constraint could not hold.
 
     Args:
-        sets: sets in order of application, as in `lexicographic_anchor`.
-        leeway: leeway, as in `lexicographic_anchor`.
+        sets: Sets in order of application, as in `lexicographic_anchor`.
+        leeway: Leeway, as in `lexicographic_anchor`.
     """
     more = leeway * bounds_of(sets).smallest_width()
     floors = [(1 + 2 * PRECISION) * depth.amax(-1) + more for depth in row_depths(sets)]
@@ -175,9 +175,9 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Cheby
     counts.
 
     Args:
-        sets: sets of batch shape ``(B,)``, the first a finite box.
-        share: share of the best slack that is enough, below 1; where the best slack is negative,
-            the one found is lower by at most ``1 - share`` of it.
+        sets: Sets of batch shape ``(B,)``, the first a finite box.
+        share: The share of the best slack that is enough, below 1; where the best slack is
+            negative, the one found is lower by at most ``1 - share`` of it.
 
     Returns:
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
