@@ -134,9 +134,10 @@ class ObstacleGeometry(PointNavGeometry):
         distance = way.side_distances
         separates = way.separating.amax(1, keepdim=True) > 0
         eligible = torch.where(separates, way.separating, distance) - self.path.precedence
-        left_out = eligible != eligible.amax(1, keepdim=True)
-        # No room is left beside a rectangle that is touched.
-        free = distance.masked_fill(distance <= 0, -torch.inf).masked_fill(left_out, torch.inf)
+        # No room is left beside a rectangle that is touched, and any beyond the other sides of it.
+        # By sums, as masks take many times as long.
+        free = torch.nn.functional.threshold(distance, 0.0, -2 * self.layout.wall)
+        free = torch.add(free, eligible.amax(1, keepdim=True) - eligible, alpha=1e30)
         # All sides of the arena count.
         rooms = torch.cat([free, way.wall_distances])
         # Of high bounds, then of low ones with their signs changed.
