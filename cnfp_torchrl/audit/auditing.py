@@ -37,6 +37,7 @@ from cnfp_torchrl.configuration import require_fields
 from cnfp_torchrl.envs import (
     Indicator,
     StateSetter,
+    action_components,
     constraint_bijectors,
     find_task_view,
     refuse_misnamed_judges,
@@ -172,6 +173,10 @@ def audit(
     return AuditReport(
         subject={
             "environment": type(bare(env)).__name__,
+            "names": {
+                "action": [part.title for part in action_components(env, head.action_dim)],
+                "observation": [part.title for part in find_task_view(env).observation_components],
+            },
             "flow": type(head.flow).__name__,
             "policy": "safe random" if actor is None else "actor",
             "judged by": "copies" if state_setter is None else "state setter",

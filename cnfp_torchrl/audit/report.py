@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -311,6 +311,7 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
 
 def _examples(report: AuditReport) -> Iterator[str]:
     """Yield the worst example of each kind of flaw, with the state it fails in."""
+    names = report.subject["names"]
     for source, measured in report.sources.items():
         for kind in ("unsound", "escaped", "dead_ends"):
             *single, together = measured
@@ -318,16 +319,29 @@ def _examples(report: AuditReport) -> Iterator[str]:
             for metrics in [x for x in single if x.examples[kind]] or [together]:
                 for example in metrics.examples[kind][:1]:
                     name = kind.replace("_", " ")
-                    yield _example(f"{metrics.name}, {source}, worst of {name}", example)
+                    yield _example(f"{metrics.name}, {source}, worst of {name}", example, names)
     for name, examples in report.executed.examples.items():
         for example in examples[:1]:
-            yield _example(f"{name}, rollouts, the last state in which it held", example)
+            yield _example(f"{name}, rollouts, the last state in which it held", example, names)
 
 
-def _example(title: str, example: dict[str, Any]) -> str:
-    lines = [f"{key}: {_short(value)}" for key, value in example.items() if key != "sets"]
+def _example(title: str, example: dict[str, Any], names: Mapping[str, Sequence[str]]) -> str:
+    shown = {key: value for key, value in example.items() if key != "sets"}
+    lines = [f"{key}: {_named(key, value, names)}" for key, value in shown.items()]
     lines += [f"set of {name}: {_short(fields)}" for name, fields in example["sets"].items()]
     return f"{title}\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def _named(key: str, value: Any, names: Mapping[str, Sequence[str]]) -> str:
+    """Return a value in words, a vector by the names of its components, where these have some."""
+    if isinstance(value, dict):
+        entries = (f"{name} {_named(name, inner, names)}" for name, inner in value.items())
+        return ", ".join(entries)
+    titles = names.get(key, ())
+    if isinstance(value, list) and len(value) == len(titles):
+        parts = (f"{title} {_short(x)}" for title, x in zip(titles, value, strict=True))
+        return f"[{', '.join(parts)}]"
+    return _short(value)
 
 
 def _short(value: Any) -> str:

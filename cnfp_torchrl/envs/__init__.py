@@ -13,6 +13,11 @@ from cnfp_torchrl.envs.cost import (
     refuse_misnamed_judges,
 )
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.observed import (
+    ObservedEntry,
+    observed_entries,
+    refuse_changed_inputs,
+)
 from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.previous_action import PreviousAction
@@ -35,8 +40,11 @@ from cnfp_torchrl.envs.task_view import (
     ShowTask,
     StateSetter,
     TaskView,
+    action_components,
     environment_layers,
     find_task_view,
+    numbered_components,
+    require_names,
 )
 
 # Whoever has an environment in hand looks for these here.
@@ -56,6 +64,7 @@ __all__ = [
     "Indicator",
     "Map",
     "Marks",
+    "ObservedEntry",
     "PackedStates",
     "Polyline",
     "PreviousAction",
@@ -67,6 +76,7 @@ __all__ = [
     "ShowTask",
     "StateSetter",
     "TaskView",
+    "action_components",
     "amounts_keys",
     "appended_transforms",
     "can_render",
@@ -77,5 +87,9 @@ __all__ = [
     "counted_constraints",
     "environment_layers",
     "find_task_view",
+    "numbered_components",
+    "observed_entries",
+    "refuse_changed_inputs",
     "refuse_misnamed_judges",
+    "require_names",
 ]

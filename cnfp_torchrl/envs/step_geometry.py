@@ -10,7 +10,12 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from cnfp_torchrl.envs.geometry_transform import Check, GeometryTransform, evidence
+from cnfp_torchrl.envs.geometry_transform import (
+    Check,
+    GeometryTransform,
+    evidence,
+    refuse_values,
+)
 from cnfp_torchrl.geometry import (
     Anchored,
     Begun,
@@ -99,8 +104,7 @@ class StepGeometry:
             checks = []
         decided, *values = flags.tolist()
         if not are_within(values, limits):
-            for check in checks or self._checks(states):
-                check.refuse()
+            refuse_values(checks or self._checks(states))
         return Step(begun, bool(decided), self._compiled is not None)
 
     def sets(self, states: TensorDictBase) -> list[ConstraintSet]:

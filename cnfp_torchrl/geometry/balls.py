@@ -64,6 +64,9 @@ class Ball(ConstraintSet):
         radius = self.radius.unsqueeze(-1)
         return Bounds(self.center - radius, self.center + radius)
 
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return torch.clamp(self.center, box.low, box.high)
+
     def inflated(self, by: Tensor) -> Self:
         return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
 

@@ -102,7 +102,8 @@ class ConstraintSet(ABC):
       dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
     - `superlevel`: a description of {slack >= t} that makes the search for anchors fast, and
-      `part_near` if the set is not convex.
+      `part_near` if the set is not convex,
+    - `deepest_within`: the deepest point within a box, which often spares that search.
 
     Constructing a set checks it, which reads tensors on the host. Hot paths construct sets with
     ``validate_args=False``: their values were checked where they entered.
@@ -196,6 +197,13 @@ class ConstraintSet(ABC):
         """
         return self.slack(action).unsqueeze(-1)
 
+    def row_count(self) -> int:
+        """Return the number m of the rows of `row_slacks`."""
+        if not self.has_rows():
+            return 1
+        like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
+        return int(self.row_slacks(like.new_zeros(self.dim)).shape[-1])
+
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
         """Return how far `eroded` moves the boundary of each row inwards, ``(*batch, m)``."""
         like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
@@ -229,6 +237,20 @@ class ConstraintSet(ABC):
         like = next(iter(self.fields().values()))
         high = torch.full((self.dim,), torch.inf, dtype=like.dtype, device=like.device)
         return Bounds(-high, high)
+
+    def deepest_within(self, box: Bounds) -> Tensor | None:
+        """Return the points of a box with the largest slack, where they have a closed form.
+
+        With them the cheapest attempts at an anchor decide most states. A box that is empty may
+        have any.
+
+        Args:
+            box: finite bounds ``(*batch, d)``.
+
+        Returns:
+            Points ``(*batch, d)``; None, the default, where there is no such form.
+        """
+        return None
 
     def superlevel(self) -> Superlevel | None:
         """Describe the actions with a slack of at least t, for the search for anchors.

@@ -71,6 +71,9 @@ class HalfSpaces(ConstraintSet):
         rows = self.superlevel()
         return (rows.offsets - _rows(rows.normals, action)) / rows.rates
 
+    def row_count(self) -> int:
+        return self.normals.shape[-2]
+
     def inflated(self, by: Tensor) -> Self:
         rows = self.superlevel()
         return self._with(rows, rows.offsets + by * rows.rates)

@@ -85,6 +85,9 @@ class KinkedSumBound(ConstraintSet):
         low, high = ((bound / s.abs()).masked_fill(s == 0, torch.inf) for s in (lower, upper))
         return Bounds(-low, high)
 
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return torch.zeros_like(box.low).clamp(box.low, box.high)
+
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # The sum is at most |center|_1 at the center, and grows at most by one each unit.
         weights = torch.full_like(self.weights, self.dim**-0.5)

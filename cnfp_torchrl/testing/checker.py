@@ -24,6 +24,7 @@ ABOUT_THE_GIVEN_ANCHOR = (
     slacks.check_superlevel,
     slacks.check_rows,
     slacks.check_inflated,
+    slacks.check_deepest_within,
     gauges.check_gauge_is_where_rays_leave,
 )
 ABOUT_ALL_ANCHORS = (

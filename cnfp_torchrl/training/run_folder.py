@@ -20,7 +20,7 @@ from torch import nn
 
 from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
 from cnfp_torchrl.training.checkpoints import CheckpointError, save_data
-from cnfp_torchrl.whole_file import whole_file, write_json
+from cnfp_torchrl.whole_file import remove_partial_files, whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
 FAILURE = "failure.json"
@@ -141,10 +141,16 @@ class RunFolder:
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
+            ValueError: for any other name of a checkpoint.
         """
+        if checkpoint not in (CHECKPOINT, BEST):
+            raise ValueError(
+                f"checkpoint: expected {CHECKPOINT}, the last policy, or {BEST}, the best one of "
+                f"training, given {checkpoint!r}"
+            )
         folder = cls(path, checkpoint)
         missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
-        if missing == [BEST]:
+        if missing == [BEST] and (folder.path / CHECKPOINT).is_file():
             raise FileNotFoundError(
                 f"checkpoint: expected {BEST} in {folder.path}, which has none, for no policy was "
                 f"scored in training without a violation; take the last one, {CHECKPOINT}"
@@ -328,6 +334,11 @@ class RunFolder:
     def how_to_resume(self, frames: int) -> str:
         """Return a sentence for whoever stopped the run."""
         return f"stopped and saved at step {frames}; go on with: {self._resuming()}"
+
+    def remove_partial_files(self) -> None:
+        """Remove what is left of files that a run was writing when it was killed."""
+        for name in (CONFIG, CHECKPOINT, BEST, SUMMARY, FAILURE, f"{STATES}/*"):
+            remove_partial_files(self.path / name)
 
     def save_failure(self, error: BaseException) -> None:
         """Write why the run failed, as far as that can be written."""

@@ -63,8 +63,9 @@ class RunState:
     def drop_what_came_after(self) -> None:
         """Remove the states and the entries of logs after the state that was loaded.
 
-        To be called before the loggers are made.
+        So are files that were half written. To be called before the loggers are made.
         """
+        self._folder.remove_partial_files()
         self._checkpoints.drop_after(self._saved_at)
         logged_at = evaluated_at = 0
         if self._saved is not None:

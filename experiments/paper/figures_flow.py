@@ -18,7 +18,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl import constrain_env
-from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
@@ -157,14 +156,12 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
 def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
     """Return the flow on the map, and the permissive and the restrictive state."""
     flow, permissive, restrictive = (snapshot(policy, name) for name in PLACES)
-    view = find_task_view(PointNavEnv())
+    env = PointNavEnv()
     restrictive = restrictive.following_the_longest_path()
     return {
-        "flow": flow_banner(flow, view),
-        "permissive": flow_stages(permissive, view=view, title=_title("Permissive", permissive)),
-        "restrictive": flow_stages(
-            restrictive, view=view, title=_title("Restrictive", restrictive)
-        ),
+        "flow": flow_banner(flow, env),
+        "permissive": flow_stages(permissive, env=env, title=_title("Permissive", permissive)),
+        "restrictive": flow_stages(restrictive, env=env, title=_title("Restrictive", restrictive)),
     }
 
 
