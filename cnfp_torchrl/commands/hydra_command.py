@@ -59,6 +59,10 @@ def hydra_command(
             with errors_in_a_sentence(), _raised_by_hydra():
                 try:
                     application()
+                except _ToldError:
+                    if WITH_TRACEBACKS:
+                        raise
+                    sys.exit(1)
                 except BrokenProcessPool:
                     if after_death is None:
                         raise
@@ -69,13 +73,17 @@ def hydra_command(
     return decorate
 
 
+class _ToldError(CompactHydraException):
+    """A failure of a sweep's run that was written when it happened; Hydra raises one at the end."""
+
+
 def is_sweep() -> bool:
     """Tell whether the job that runs is one of a sweep."""
     return bool(HydraConfig.get().mode == RunMode.MULTIRUN)
 
 
 def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
-    """Call a function, and write at once why it fails: Hydra tells of one failure, at the end."""
+    """Call a function, and write at once why it fails: Hydra raises one failure, at the end."""
     is_in_worker = is_side_by_side(HydraConfig.get())
     try:
         if is_in_worker:
@@ -86,20 +94,21 @@ def _run_of_sweep(function: Callable[[DictConfig], R], config: DictConfig) -> R:
         if not is_in_worker:
             raise
         # As a failure, for joblib would kill the others.
-        left = RuntimeError(f"the run was left by sys.exit, with {end}")
-        raise CompactHydraException(str(as_stop(end) or _told(left))) from end
+        if stop := as_stop(end):
+            raise CompactHydraException(str(stop)) from end
+        raise _told(RuntimeError(f"the run was left by sys.exit, with {end}")) from end
     except Exception as error:
         # Not the end of the process, which would be that of the sweep.
-        raise CompactHydraException(_told(error)) from error
+        raise _told(error) from error
     finally:
         if is_in_worker:
             end_run()
 
 
-def _told(error: Exception) -> str:
-    """Write why a run of a sweep fails, and return it."""
+def _told(error: Exception) -> _ToldError:
+    """Write why a run of a sweep fails, and return what Hydra may raise."""
     folder = Path(HydraConfig.get().runtime.output_dir).name
-    return write_error(error, f"{folder}: ")
+    return _ToldError(write_error(error, f"{folder}: "))
 
 
 @contextmanager

@@ -29,18 +29,21 @@ TABLE, MEANS, FIGURE = "sweep.csv", "sweep_means.csv", "sweep.png"
 """The files in the sweep's folder."""
 
 
-def run_rows(runs: Sequence[SweepRun]) -> list[list[str]]:
-    """Return a header and a row for each run."""
+def run_rows(runs: Sequence[SweepRun], *, with_reasons: bool = True) -> list[list[str]]:
+    """Return a header and a row for each run.
+
+    Args:
+        runs: The runs.
+        with_reasons: Whether the state of a run that failed or was stopped says why.
+    """
     keys = varied(runs)
-    header = [*keys, "score", "violations", "relaxation", "seconds", "folder", "state"]
-    return [header, *(_run_row(run, keys) for run in runs)]
-
-
-def _run_row(run: SweepRun, keys: Sequence[str]) -> list[str]:
-    numbers = (run.score, run.violations, run.relaxation, run.seconds)
-    state = f"{run.state}: {run.reason}" if run.reason else run.state
-    settings = [run.overrides.get(key, "") for key in keys]
-    return [*settings, *map(_number, numbers), run.path.name, state]
+    rows = [[*keys, "score", "violations", "relaxation", "seconds", "folder", "state"]]
+    for run in runs:
+        numbers = (run.score, run.violations, run.relaxation, run.seconds)
+        state = f"{run.state}: {run.reason}" if with_reasons and run.reason else run.state
+        settings = [run.overrides.get(key, "") for key in keys]
+        rows.append([*settings, *map(_number, numbers), run.path.name, state])
+    return rows
 
 
 def mean_rows(runs: Sequence[SweepRun]) -> list[list[str]]:
@@ -80,7 +83,10 @@ def _number(value: float | None) -> str:
 
 
 def report(folder: Path) -> str:
-    """Write table, means and figure of a sweep into its folder, and return both tables as text."""
+    """Write table, means and figure of a sweep into its folder, and return both tables as text.
+
+    Why runs failed or were stopped stands below the table, which it would make too wide.
+    """
     runs = read_sweep(folder, planned_runs(folder))
     tables = {TABLE: run_rows(runs)}
     if SEED in varied(runs):
@@ -91,9 +97,11 @@ def report(folder: Path) -> str:
         with whole_file(folder / name) as file:
             file.write(text.getvalue().encode())
     save_sweep(runs, folder / FIGURE)
-    parts = [text_table(rows) for rows in tables.values()]
+    shown = tables | {TABLE: run_rows(runs, with_reasons=False)}
+    tables_as_text = [text_table(rows) for rows in shown.values()]
+    reasons = [f"{run.path.name} {run.state}: {run.reason}" for run in runs if run.reason]
     files = ", ".join(str(folder / name) for name in (*tables, FIGURE))
-    return "\n\n".join([*parts, files])
+    return "\n\n".join(["\n".join([tables_as_text[0], *reasons]), *tables_as_text[1:], files])
 
 
 def resume(

@@ -40,8 +40,11 @@ from cnfp_torchrl.envs.task_view import (
     ShowTask,
     StateSetter,
     TaskView,
+    action_components,
     environment_layers,
     find_task_view,
+    numbered_components,
+    require_names,
 )
 
 # Whoever has an environment in hand looks for these here.
@@ -73,6 +76,7 @@ __all__ = [
     "ShowTask",
     "StateSetter",
     "TaskView",
+    "action_components",
     "amounts_keys",
     "appended_transforms",
     "can_render",
@@ -83,7 +87,9 @@ __all__ = [
     "counted_constraints",
     "environment_layers",
     "find_task_view",
+    "numbered_components",
     "observed_entries",
     "refuse_changed_inputs",
     "refuse_misnamed_judges",
+    "require_names",
 ]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -251,6 +252,69 @@ def find_task_view(env: EnvBase | None) -> TaskView:
         elif hasattr(type(layer), "task_view"):
             return layer.task_view(env)  # type: ignore[attr-defined]
     return NOTHING
+
+
+def action_components(env: EnvBase | None, dim: int) -> tuple[Component, ...]:
+    """Return what the components of an environment's action are called, with their units.
+
+    The task's names come first, then those of MuJoCo's actuators, then numbers: ``a1``, ``a2``, ...
+
+    Args:
+        env: The environment; None numbers the components.
+        dim: The dimension of the action space.
+
+    Raises:
+        ValueError: when the task names another number of components, or two of them alike.
+    """
+    view = find_task_view(env)
+    named = tuple(view.action_components)
+    if not named:
+        return _actuators(env, dim) or numbered_components("a", dim)
+    require_names("action_components", "action", named, dim, view)
+    return named
+
+
+def numbered_components(letter: str, count: int) -> tuple[Component, ...]:
+    """Return components without names of their own, counted from 1."""
+    return tuple(Component(f"{letter}{i + 1}") for i in range(count))
+
+
+def require_names(
+    field: str, whose: str, named: Sequence[Component], count: int, view: TaskView
+) -> None:
+    """Refuse names of a task's view that do not fit.
+
+    Args:
+        field: The field of the view.
+        whose: The vector that is named.
+        named: The names and units.
+        count: The vector's number of components.
+        view: The view.
+
+    Raises:
+        ValueError: when there are more or fewer names than components, or two that are alike.
+    """
+    given = [component.name for component in named]
+    if len(given) != count:
+        raise ValueError(
+            f"{field}: expected {count} names, one for each component of the {whose}, "
+            f"given {len(given)} by {type(view).__name__}"
+        )
+    if len(set(given)) != count:
+        raise ValueError(
+            f"{field}: expected a different name for each component of the {whose}, given {given} "
+            f"by {type(view).__name__}"
+        )
+
+
+def _actuators(env: EnvBase | None, dim: int) -> tuple[Component, ...]:
+    """Return the names of MuJoCo's actuators, where an environment has them."""
+    for layer in environment_layers(env):
+        model: Any = getattr(layer, "__dict__", {}).get("model")
+        if getattr(model, "nu", None) == dim:
+            names = [model.actuator(i).name or f"a{i + 1}" for i in range(dim)]
+            return tuple(Component(name) for name in names)
+    return ()
 
 
 def environment_layers(env: EnvBase | None) -> Iterator[object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import torch
@@ -26,11 +26,11 @@ class VisibleRegion(ConstraintSet):
     pathwise gradient leaves out the jumps.
 
     Args:
-        position: positions p, ``(*batch, d)``, in units of length. A position in a rectangle makes
+        position: Positions p, ``(*batch, d)``, in units of length. A position in a rectangle makes
             the set empty.
-        rectangles: lowest and highest corners of m rectangles, ``(*batch, m, 2, d)``, in units of
+        rectangles: Lowest and highest corners of m rectangles, ``(*batch, m, 2, d)``, in units of
             length; infinite ones make walls, see `walls`.
-        step: lengths moved by an action of one, ``(*batch,)``, positive and finite.
+        step: Lengths moved by an action of one, ``(*batch,)``, positive and finite.
     """
 
     position: Tensor
@@ -45,8 +45,8 @@ class VisibleRegion(ConstraintSet):
         """Return 2d infinite rectangles, ``(*batch, 2d, 2, d)``, that enclose an arena.
 
         Args:
-            low: lowest corner of the arena, ``(*batch, d)``.
-            high: highest corner of the arena, ``(*batch, d)``.
+            low: The lowest corner of the arena, ``(*batch, d)``.
+            high: The highest corner of the arena, ``(*batch, d)``.
         """
         on_axis = torch.eye(low.shape[-1], dtype=torch.bool, device=low.device)
         below = torch.where(on_axis, low.unsqueeze(-2), torch.inf)
@@ -143,17 +143,35 @@ class VisibleRegion(ConstraintSet):
         below = torch.where(wall & high.isfinite(), high, -torch.inf).amax(-2)
         return Bounds(below, above)
 
-    def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
+    def eroded(self, magnitude: Tensor | float = 1.0) -> SeenFromOutside:
+        """Return the part that is well inside, see `SeenFromOutside`."""
         grown = self._grown(magnitude).unsqueeze(-1)
         low, high = self.rectangles.unbind(-2)
-        rectangles = torch.stack([low - grown, high + grown], -2)
-        return type(self)(self.position, rectangles, self.step, validate_args=False)
+        outer_low, outer_high = low - grown, high + grown
+        position = self.position.unsqueeze(-2)
+        takes_in = ((outer_low <= position) & (position <= outer_high)).all(-1, keepdim=True)
+        # Of each grown rectangle that takes in the position it is left through the side of the
+        # rectangle itself that the position is farthest from.
+        before = torch.cat([low - position, position - high], -1)
+        nearest = takes_in & (before > 0) & (before == before.amax(-1, keepdim=True))
+        left, right = nearest.chunk(2, -1)
+        last = torch.where(left, outer_low, torch.inf).amin(-2)
+        first = torch.where(right, outer_high, -torch.inf).amax(-2)
+        seen_from = torch.where(left.any(-2), last, self.position)
+        seen_from = torch.where(right.any(-2), first, seen_from)
+        return SeenFromOutside(
+            seen_from,
+            torch.stack([outer_low, outer_high], -2),
+            self.step,
+            (seen_from - self.position) / self.step.unsqueeze(-1),
+            validate_args=False,
+        )
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        """Return how far `eroded` moves the boundary, infinite where it takes in the position."""
+        """Return how far `eroded` moves the boundary, infinite where nothing is left of the set."""
         moved = self._grown(magnitude).amax(-1) / self.step
-        outside = self.eroded(magnitude).slack(torch.zeros_like(self.position)) > 0
-        return torch.where(outside, moved, torch.inf).unsqueeze(-1)
+        inner = self.eroded(magnitude)
+        return torch.where(inner.slack(inner.moved) >= 0, moved, torch.inf).unsqueeze(-1)
 
     def _grown(self, magnitude: Tensor | float) -> Tensor:
         """Return the rounding error of each rectangle's corners, ``(*batch, m)``, in length."""
@@ -251,6 +269,64 @@ class VisibleRegion(ConstraintSet):
         return low, high
 
 
+@dataclass(frozen=True, eq=False)
+class SeenFromOutside(VisibleRegion):
+    r"""Moves that end in sight of another point than the position, next to it.
+
+    What `VisibleRegion.eroded` returns. Rectangles that are grown by a rounding error may take in a
+    position that is not in them. Seen from there would be nothing; here the move starts at the
+    position, but what it must not touch is looked at from the nearest point outside of the grown
+    rectangles, so that it leads away. As that point is no farther than what they have grown by, the
+    straight move touches none of the rectangles themselves.
+
+    Args:
+        position: points that are seen from, ``(*batch, d)``, in units of length.
+        rectangles: corners of the grown rectangles, ``(*batch, m, 2, d)``.
+        step: lengths moved by an action of one, ``(*batch,)``.
+        moved: actions that lead from the true position to that point, ``(*batch, d)``; 0 where
+            they are the same.
+    """
+
+    moved: Tensor
+
+    event_dims: ClassVar[Mapping[str, int]] = {**VisibleRegion.event_dims, "moved": 1}
+
+    def contains(self, action: Tensor) -> Tensor:
+        return self.slack(action) >= 0
+
+    def slack(self, action: Tensor) -> Tensor:
+        return super().slack(action - self.moved)
+
+    def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
+        return super().gauge(direction, anchor - self.moved)
+
+    def bounding_box(self) -> Bounds:
+        low, high = super().bounding_box()
+        return Bounds(low + self.moved, high + self.moved)
+
+    def eroded(self, magnitude: Tensor | float = 1.0) -> SeenFromOutside:
+        inner = super().eroded(magnitude)
+        return replace(inner, moved=inner.moved + self.moved, validate_args=False)
+
+    def around(self, center: Tensor, radius: Tensor) -> Self:
+        part = VisibleRegion.around(
+            VisibleRegion(self.position, self.rectangles, self.step, validate_args=False),
+            center,
+            radius,
+        )
+        return type(self)(**part.fields(), moved=torch.zeros_like(center), validate_args=False)
+
+    def part_near(self, point: Tensor) -> Rows:
+        return self._from_the_position(super().part_near(point - self.moved))
+
+    def parts_near(self, point: Tensor) -> Rows:
+        return self._from_the_position(super().parts_near(point - self.moved))
+
+    def _from_the_position(self, part: Rows) -> Rows:
+        along = (part.normals * self.moved.unsqueeze(-2)).sum(-1)
+        return replace(part, offsets=part.offsets + along)
+
+
 def _chosen(normals: Tensor, offsets: Tensor, valid: Tensor, index: Tensor) -> Rows:
     """Return one half-space for each rectangle, by its index ``(*parts, *batch, m)``."""
     # Not take_along_dim, with which an exported program would be one for a single batch size.
@@ -274,12 +350,12 @@ class VisibleOrBox(ConstraintSet):
     nothing; a box that leaves out 0 can.
 
     Args:
-        position: positions of the `VisibleRegion`, ``(*batch, d)``.
-        rectangles: corners of its rectangles, ``(*batch, m, 2, d)``.
-        step: lengths moved by an action of one, ``(*batch,)``.
-        low: lower bounds of the box, ``(*batch, d)``.
-        high: upper bounds of the box, ``(*batch, d)``.
-        in_sight: choice of the visible region (1) or the box (0), ``(*batch,)``.
+        position: Positions of the `VisibleRegion`, ``(*batch, d)``.
+        rectangles: Corners of its rectangles, ``(*batch, m, 2, d)``.
+        step: Lengths moved by an action of one, ``(*batch,)``.
+        low: Lower bounds of the box, ``(*batch, d)``.
+        high: Upper bounds of the box, ``(*batch, d)``.
+        in_sight: The choice of the visible region (1) or the box (0), ``(*batch,)``.
     """
 
     position: Tensor
@@ -340,8 +416,9 @@ class VisibleOrBox(ConstraintSet):
         )
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        fields = {**self.region.eroded(magnitude).fields(), **self.box.eroded(magnitude).fields()}
-        return type(self)(**fields, in_sight=self.in_sight, validate_args=False)
+        region, box = self.region.eroded(magnitude), self.box.eroded(magnitude)
+        fields = {"position": region.position, "rectangles": region.rectangles, "step": region.step}
+        return type(self)(**fields, **box.fields(), in_sight=self.in_sight, validate_args=False)
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         parts = (self.region.around(center, radius), self.box.around(center, radius))

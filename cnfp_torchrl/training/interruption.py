@@ -40,8 +40,8 @@ class TrainingInterrupted(BaseException):
     No `Exception`, which Hydra would take for a failure and go on with the next run of a sweep.
 
     Args:
-        number: number of the signal.
-        message: sentence that says how to go on.
+        number: The number of the signal.
+        message: The sentence that says how to go on.
     """
 
     def __init__(self, number: int, message: str) -> None:
@@ -61,8 +61,8 @@ class StopRequest:
     Outside of the main thread, where Python takes no signals, nothing is changed.
 
     Args:
-        at_once: sentence that says how to go on after a second one.
-        signals: numbers of the signals; none changes nothing.
+        at_once: Sentence that says how to go on after a second one.
+        signals: Numbers of the signals; none changes nothing.
     """
 
     def __init__(self, at_once: str, signals: Sequence[int] = STOP_SIGNALS) -> None:
@@ -87,7 +87,7 @@ class StopRequest:
         """End by a signal at once, for work that begins anew when the run goes on.
 
         Args:
-            message: sentence that says how to go on.
+            message: The sentence that says how to go on.
 
         Raises:
             TrainingInterrupted: when a signal comes, or has come before.

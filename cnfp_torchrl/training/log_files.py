@@ -18,9 +18,9 @@ def cut_logs(folder: Path, step: int, evaluated_at: int) -> None:
     What is removed will be written anew, so that no row is missing and none is there twice.
 
     Args:
-        folder: a run's folder, in whose subfolders the loggers write.
-        step: the last one whose entries stay.
-        evaluated_at: the last one of which an evaluation stays: that of a run's end comes behind
+        folder: A run's folder, in whose subfolders the loggers write.
+        step: The last one whose entries stay.
+        evaluated_at: The last one of which an evaluation stays: that of a run's end comes behind
             the state of the same step.
     """
 

@@ -36,8 +36,8 @@ class RunFolder:
     """The folder of one training run: configuration, checkpoint, summary, metrics and figures.
 
     Args:
-        path: the folder.
-        checkpoint: name of the file that policies are read from.
+        path: The folder.
+        checkpoint: The name of the file that policies are read from.
     """
 
     def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
@@ -136,15 +136,21 @@ class RunFolder:
         """Return the folder of a finished run.
 
         Args:
-            path: the folder.
-            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
+            path: The folder.
+            checkpoint: The name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
+            ValueError: for any other name of a checkpoint.
         """
+        if checkpoint not in (CHECKPOINT, BEST):
+            raise ValueError(
+                f"checkpoint: expected {CHECKPOINT}, the last policy, or {BEST}, the best one of "
+                f"training, given {checkpoint!r}"
+            )
         folder = cls(path, checkpoint)
         missing = [n for n in (CONFIG, checkpoint) if not (folder.path / n).is_file()]
-        if missing == [BEST]:
+        if missing == [BEST] and (folder.path / CHECKPOINT).is_file():
             raise FileNotFoundError(
                 f"checkpoint: expected {BEST} in {folder.path}, which has none, for no policy was "
                 f"scored in training without a violation; take the last one, {CHECKPOINT}"
@@ -185,7 +191,7 @@ class RunFolder:
         Sections of training alone, such as the optimizer's, are left out; `load_settings` has them.
 
         Args:
-            trusted: packages, modules or objects that may be named beside what the shipped
+            trusted: Packages, modules or objects that may be named beside what the shipped
                 configuration names, such as ``my_package.envs.``.
 
         Raises:
@@ -205,7 +211,7 @@ class RunFolder:
         """Read what the run can be trained further from: all of its configuration.
 
         Args:
-            trusted: see `load_config`.
+            trusted: See `load_config`.
 
         Raises:
             ValueError: as `load_config`.
@@ -329,7 +335,7 @@ class RunFolder:
         """Return a sentence for whoever stopped the run.
 
         Args:
-            frames: the steps at which it was saved; None when it was not.
+            frames: The steps at which it was saved; None when it was not.
         """
         how = "ended at once" if frames is None else f"stopped and saved at step {frames}"
         return f"{how}; go on with: {self._resuming()}"

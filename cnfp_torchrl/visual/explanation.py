@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from cnfp_torchrl.envs import NOTHING, Component, TaskView
+from cnfp_torchrl.envs import NOTHING, Component, TaskView, numbered_components
 from cnfp_torchrl.text_table import markdown_table, text_table
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
@@ -253,7 +253,7 @@ def explain(
         samples=len(snapshot.latents),
         situation=view.situation(snapshot.state),
         is_safe=snapshot.is_safe,
-        components=tuple(components) or numbered_components(snapshot.dim),
+        components=tuple(components) or numbered_components("a", snapshot.dim),
     )
 
 
@@ -327,11 +327,6 @@ def unit_of(components: Sequence[Component]) -> str:
     """Return the unit of distances between actions: that of all components, if they have one."""
     units = {component.unit for component in components}
     return units.pop() or _ACTION_UNITS if len(units) == 1 else _ACTION_UNITS
-
-
-def numbered_components(dim: int) -> tuple[Component, ...]:
-    """Return components without names of their own, counted from 1."""
-    return tuple(Component(f"a{i + 1}") for i in range(dim))
 
 
 def _percent(share: float | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,14 +14,16 @@ from torchrl.envs import EnvBase
 from cnfp_torchrl.envs import (
     Component,
     TaskView,
+    action_components,
     counted_constraints,
-    environment_layers,
     find_task_view,
+    numbered_components,
+    require_names,
 )
 from cnfp_torchrl.keys import OBSERVATION_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule
 from cnfp_torchrl.visual.colors import constraint_colors
-from cnfp_torchrl.visual.explanation import numbered_components, unit_of
+from cnfp_torchrl.visual.explanation import unit_of
 from cnfp_torchrl.visual.snapshot import FlowSnapshot
 
 _MOST_OBSERVED = 64
@@ -97,7 +99,7 @@ class Setting:
 
         Raises:
             ValueError: when a projection does not name two different components of the action, when
-                the flow has no density, or when the task names another number of components.
+                the flow has no density, or when the task's names of components do not fit.
         """
         if not head.flow.has_density:
             raise ValueError(
@@ -105,12 +107,6 @@ class Setting:
                 f"{type(head.flow).__name__}, whose stages have none to draw"
             )
         view, dim = find_task_view(env), head.action_dim
-        named = view.action_components or _actuators(env, dim) or numbered_components(dim)
-        if len(named) != dim:
-            raise ValueError(
-                f"action_components: expected {dim} names, one for each component of the action, "
-                f"given {len(named)} by {type(view).__name__}"
-            )
         leaves_bounds = head.flow.reads_constraints and not head.flow.is_safe
         return cls(
             stages=tuple(head.stage_names),
@@ -119,7 +115,7 @@ class Setting:
             high=tuple(head.bounds.high.tolist()),
             projections=_projections(dim, projections),
             view=view,
-            components=tuple(named),
+            components=action_components(env, dim),
             observation=_observation(env, view),
             costs=() if env is None else counted_constraints(env),
             moves=head.flow.is_safe,
@@ -127,13 +123,13 @@ class Setting:
             leaves_bounds=leaves_bounds,
         )
 
-    def holding(self, snapshot: FlowSnapshot, view: TaskView) -> Setting:
-        """Return this setting with another view of the task, reaching to all samples."""
+    def holding(self, snapshot: FlowSnapshot) -> Setting:
+        """Return this setting, reaching to all samples of a step."""
         bounds = snapshot.region.bounds
         samples = torch.stack([stage.samples for stage in snapshot.stages]).flatten(0, 1)
         middle, half = (bounds.low + bounds.high) / 2, (bounds.high - bounds.low) / 2
         farthest = 1.05 * float(((samples - middle) / half).abs().max())
-        return replace(self, view=view, reach=max(self.reach, farthest))
+        return replace(self, reach=max(self.reach, farthest))
 
     @property
     def unit(self) -> str:
@@ -169,6 +165,10 @@ class Setting:
         """Return a component's name, unit and bounds."""
         return axis_title(self.components[component], (self.low[component], self.high[component]))
 
+    def names(self, components: Sequence[int]) -> str:
+        """Return the names of some components of the action."""
+        return ", ".join(self.components[component].name for component in components)
+
     def rows(self) -> list[list[StageView]]:
         """Return the views, a row for each projection, stages from left to right."""
         rows = []
@@ -201,34 +201,16 @@ def axis_title(component: Component, limits: tuple[float, float]) -> str:
     return f"{component.title}, {low:.3g} to {high:.3g}"
 
 
-def pair_name(components: Sequence[int]) -> str:
-    """Return what two components of the action are called, counted from 1."""
-    return ", ".join(f"a{component + 1}" for component in components)
-
-
-def _actuators(env: EnvBase | None, dim: int) -> tuple[Component, ...]:
-    """Return the names of MuJoCo's actuators, where an environment has them."""
-    for layer in environment_layers(env):
-        model: Any = getattr(layer, "__dict__", {}).get("model")
-        if getattr(model, "nu", None) == dim:
-            names = [model.actuator(i).name or f"a{i + 1}" for i in range(dim)]
-            return tuple(Component(name) for name in names)
-    return ()
-
-
 def _observation(env: EnvBase | None, view: TaskView) -> tuple[Component, ...]:
     spec = None if env is None else env.observation_spec.get(OBSERVATION_KEY, None)
     if env is None or spec is None or len(spec.shape) != len(env.batch_size) + 1:
         return ()
     size, named = spec.shape[-1], tuple(view.observation_components)
-    if named and len(named) != size:
-        raise ValueError(
-            f"observation_components: expected {size} names, one for each component of the "
-            f"observation, given {len(named)} by {type(view).__name__}"
-        )
+    if named:
+        require_names("observation_components", "observation", named, size, view)
     if size > _MOST_OBSERVED:
         return ()
-    return named or tuple(Component(f"o{i + 1}") for i in range(size))
+    return named or numbered_components("o", size)
 
 
 def _projections(

@@ -1,6 +1,6 @@
 """Time layers that turn wished actions into allowed ones, and count what they leave broken.
 
-    pip install 'cnfp_torchrl[bench]' osqp proxsuite pinet-hcnn && pip install --no-deps qpth
+    pip install 'cnfp_torchrl[bench]' pinet-hcnn && pip install --no-deps qpth
     python experiments/benchmarks/layers.py [--quick] [--rounds 5] [--output FOLDER]
 
 Three problems in float64: eight rows inside the bounds of six components (a quadratic program a
@@ -58,8 +58,9 @@ class Layer:
     """A layer on one batch of wished actions.
 
     Args:
-        forward: Returns allowed actions.
-        backward: Computes them, and the gradient of the sum of their squares; None without one.
+        forward: The function that returns allowed actions.
+        backward: The function that computes them, and the gradient of the sum of their squares;
+            None without one.
     """
 
     forward: Callable[[], Any]

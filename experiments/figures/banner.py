@@ -14,9 +14,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
 from cnfp_torchrl import constrain_env
-from cnfp_torchrl.envs import Marks, TaskView, find_task_view
+from cnfp_torchrl.envs import Marks
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.visual import FlowSnapshot, Scene, Setting, take_snapshot
@@ -48,7 +49,7 @@ _LEFT, _WIDTH, _GAP, _BOTTOM, _HEIGHT = 0.014, 0.166, 0.0355, 0.11, 0.664
 
 def flow_banner(
     snapshot: FlowSnapshot,
-    view: TaskView,
+    env: EnvBase,
     *,
     colors: Mapping[str, str] | None = None,
     detail: Detail = PRINTED,
@@ -59,14 +60,14 @@ def flow_banner(
     The last caption counts violations among many further samples.
 
     Args:
-        snapshot: of an exact flow with two action components.
-        view: of a task with a map.
-        colors: of the constraints; None chooses them by name.
-        detail: how fine.
-        counted: number of the further samples.
+        snapshot: The snapshot of an exact flow with two action components.
+        env: The environment of a task with a map.
+        colors: The colors of the constraints; None chooses them by name.
+        detail: How fine.
+        counted: The number of the further samples.
     """
     scene, plane = (
-        Scene(Setting.of(snapshot.head).holding(snapshot, view), snapshot, detail),
+        Scene(Setting.of(snapshot.head, env).holding(snapshot), snapshot, detail),
         (0, 1),
     )
     assert scene.log_density is not None
@@ -214,7 +215,7 @@ def main(path: Path) -> None:
     actor = make_constrained_actor(StandardNormal(), env)
     state = env.reset(position=POSITION, battery=BATTERY, goal=GOAL)
     snapshot = take_snapshot(actor, state, samples=700)
-    save_png(flow_banner(snapshot, find_task_view(env)), path, dpi=DPI)
+    save_png(flow_banner(snapshot, env), path, dpi=DPI)
 
 
 if __name__ == "__main__":

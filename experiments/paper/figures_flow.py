@@ -18,7 +18,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl import constrain_env
-from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.modules import ExactFlow, flow_head, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.agent import build_environment, load_actor
@@ -35,9 +34,9 @@ class Place(NamedTuple):
     """A state of point navigation.
 
     Args:
-        position: of the agent, in arena units.
-        battery: in percent.
-        goal: in arena units.
+        position: The position of the agent, in arena units.
+        battery: The battery in percent.
+        goal: The goal in arena units.
     """
 
     position: tuple[float, float]
@@ -67,8 +66,8 @@ class KeptPolicy(Kept):
     """The Gaussians that a network puts into `PLACES`.
 
     Args:
-        source: where they come from, in words.
-        gaussians: one for each place, by its name.
+        source: Where they come from, in words.
+        gaussians: One for each place, by its name.
     """
 
     source: Text
@@ -92,8 +91,8 @@ class FixedGaussian(nn.Module):
     """The same location and scale in every state.
 
     Args:
-        loc: location, ``(d,)``.
-        scale: scale, ``(d,)``.
+        loc: The location, ``(d,)``.
+        scale: The scale, ``(d,)``.
     """
 
     def __init__(self, loc: Tensor, scale: Tensor) -> None:
@@ -110,8 +109,8 @@ def find_policy(path: Path, runs: Path) -> KeptPolicy:
     """Return the kept policy; else keep that of a finished run; else `UNTRAINED`.
 
     Args:
-        path: of the kept policy.
-        runs: folder of runs; those of ``experiment=exact`` are in its folder ``exact``.
+        path: The path of the kept policy.
+        runs: The folder of runs; those of ``experiment=exact`` are in its folder ``exact``.
 
     Raises:
         ValueError: when what is there cannot be used, naming it.
@@ -157,14 +156,12 @@ def policy_of(folder: RunFolder) -> KeptPolicy:
 def flow_figures(policy: KeptPolicy) -> dict[str, Figure]:
     """Return the flow on the map, and the permissive and the restrictive state."""
     flow, permissive, restrictive = (snapshot(policy, name) for name in PLACES)
-    view = find_task_view(PointNavEnv())
+    env = PointNavEnv()
     restrictive = restrictive.following_the_longest_path()
     return {
-        "flow": flow_banner(flow, view),
-        "permissive": flow_stages(permissive, view=view, title=_title("Permissive", permissive)),
-        "restrictive": flow_stages(
-            restrictive, view=view, title=_title("Restrictive", restrictive)
-        ),
+        "flow": flow_banner(flow, env),
+        "permissive": flow_stages(permissive, env=env, title=_title("Permissive", permissive)),
+        "restrictive": flow_stages(restrictive, env=env, title=_title("Restrictive", restrictive)),
     }
 
 

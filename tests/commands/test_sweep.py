@@ -49,10 +49,14 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(
     assert f"{first['folder']}: " in done.stderr.partition("Error executing job")[0]
     assert first["state"].startswith("failed: ")
     assert "nan" in first["state"]
+    reason = first["state"].removeprefix("failed: ").partition(": ")[2]
+    assert done.stderr.count(reason) == 1
     assert second["state"] == "done"
     assert second["folder"] == "1_lr-0.001"
     assert str(sweep / "sweep.csv") in done.stdout
     assert first["state"] in done.stdout
+    printed = done.stdout[done.stdout.index("optim.lr  score") :].splitlines()
+    assert all(len(line) <= 100 for line in printed[:3])
     # What refuses to go on with a complete run says nothing of it.
     complete = sweep / second["folder"]
     monkeypatch.chdir(tmp_path)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from cnfp_torchrl.envs import find_task_view
 from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.visual.figures.canvas import save_png
 from experiments.figures.banner import flow_banner
@@ -22,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_banner(tmp_path: Path) -> None:
     snapshot = make_snapshot(first(PLANE, 2))
     snapshot.state["observation"] = torch.tensor([0.35, 0.0, 0.3, 0.5, 0.5])
-    figure = flow_banner(snapshot, find_task_view(PointNavEnv()), counted=120_000)
+    figure = flow_banner(snapshot, PointNavEnv(), counted=120_000)
     captions = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert captions[::2] == ["the state", "base", "action bounds", "battery", "obstacle"]
     assert captions[-1] == "0 of 120,000 actions break a rule"

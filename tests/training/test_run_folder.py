@@ -80,6 +80,22 @@ def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
         RunFolder.open(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["best", "last", "checkpoints/state-1.pt", ""])
+def test_a_checkpoint_of_another_name_is_refused_with_those_that_there_are(
+    name: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=f"^checkpoint: expected {CHECKPOINT}.*{BEST}"):
+        RunFolder.open(tmp_path, name)
+
+
+def test_a_run_that_was_stopped_without_a_best_policy_is_to_be_finished(tmp_path: Path) -> None:
+    (tmp_path / CONFIG).touch()
+    with pytest.raises(
+        FileNotFoundError, match=f"finish the run with cnfp-train resume={tmp_path}"
+    ):
+        RunFolder.open(tmp_path, BEST)
+
+
 def test_a_finished_run_without_a_best_policy_is_not_to_be_trained_again(tmp_path: Path) -> None:
     for name in (CONFIG, CHECKPOINT):
         (tmp_path / name).touch()

@@ -31,7 +31,7 @@ from tests.visual.cases import (
 
 
 def setting_of(snapshot: FlowSnapshot, view: TaskView = NOTHING) -> Setting:
-    return Setting.of(snapshot.head).holding(snapshot, view)
+    return replace(Setting.of(snapshot.head).holding(snapshot), view=view)
 
 
 def scene_of(snapshot: FlowSnapshot, reach: float | None = None, cells: int = 31) -> Scene:

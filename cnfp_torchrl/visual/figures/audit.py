@@ -72,8 +72,11 @@ def audit_figure(report: AuditReport) -> Figure:
         )
         for part in lower:
             *panels, remarks = part.subplots(1, len(scenes) + 1, squeeze=False)[0]
+            names = report.subject["names"]["action"]
             for axes, scene in zip(panels, scenes, strict=True):
                 _draw_scene(axes, scene, report.order, colors)
+                axes.set_xlabel(names[0])
+                axes.set_ylabel(names[1])
             _write_remarks(remarks, report, has_scenes=bool(scenes))
     return figure
 
@@ -195,8 +198,6 @@ def _draw_scene(
     axes.set_xlim(view[0], view[1])
     axes.set_ylim(view[2], view[3])
     axes.set_aspect("equal")
-    axes.set_xlabel("$a_1$")
-    axes.set_ylabel("$a_2$")
     axes.set_title(
         f"worst for {scene.name}, {scene.source}: {scene.reason}\n{_state_text(scene.state)}",
         fontsize=8.5,

@@ -25,10 +25,13 @@ TIMES = ("train/steps_per_second", "train/seconds", "train/processor_seconds")
 RELAXATIONS = {
     "relaxed/": "share of steps relaxed",
     "dropped/": "share of steps dropped",
-    "relaxation/": "largest relaxation (action units)",
-    "mean_relaxation/": "mean relaxation (action units)",
+    "relaxation/": "largest relaxation ({unit})",
+    "mean_relaxation/": "mean relaxation ({unit})",
 }
 """What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
+
+JUDGED = "evaluation/violations_"
+"""Of each constraint, the violating steps in an evaluation during training."""
 
 _LOSSES = {"qvalue": "critic", "alpha": "α"}
 _TITLES = {"alpha": "entropy coefficient α", "entropy": "policy entropy (nats)"}
@@ -63,8 +66,9 @@ def learning_curves(
     *,
     colors: Mapping[str, str] | None = None,
     title: str = "Learning curves",
+    unit: str = "action units",
 ) -> Figure:
-    """Draw return, cumulative violations by constraint, and whatever else was logged of learning.
+    """Draw return, violations by constraint, and whatever else was logged of learning.
 
     Relaxations are drawn where a constraint was relaxed. A panel without a curve says why; so does
     the figure of a run without any scalars.
@@ -73,6 +77,7 @@ def learning_curves(
         curves: Steps and values by name, see `read_scalars`.
         colors: The colors of the constraints; None chooses them by the names found.
         title: The title above the panels.
+        unit: The unit of distances between actions.
     """
     if not curves:
         return message_figure(
@@ -81,19 +86,21 @@ def learning_curves(
             "Train with logger=csv or logger=csv_tensorboard to see its curves here.",
         )
     counted = _by_constraint(curves, VIOLATIONS)
-    relaxations = {title: _by_constraint(curves, prefix) for prefix, title in RELAXATIONS.items()}
-    relaxations = {
-        title: group
-        for title, group in relaxations.items()
-        if any(values.any() for _, values in group.values())
+    headings = {JUDGED: "violations in an evaluation (steps)"}
+    headings |= {prefix: heading.format(unit=unit) for prefix, heading in RELAXATIONS.items()}
+    groups = {
+        heading: group
+        for prefix, heading in headings.items()
+        if (group := _by_constraint(curves, prefix))
+        # That no constraint was broken is news, that none gave way is not.
+        and (prefix == JUDGED or any(values.any() for _, values in group.values()))
     }
     others = {
         name: curve
         for name, curve in curves.items()
-        if name not in (RETURN, EVALUATED, *TIMES)
-        and not name.startswith((VIOLATIONS, *RELAXATIONS))
+        if name not in (RETURN, EVALUATED, *TIMES) and not name.startswith((VIOLATIONS, *headings))
     }
-    panels = 2 + len(relaxations) + len(others)
+    panels = 2 + len(groups) + len(others)
     rows = -(-panels // _COLUMNS)
     columns = -(-panels // rows)
     last = max(float(steps.max()) for steps, _ in curves.values())
@@ -102,13 +109,13 @@ def learning_curves(
         figure.suptitle(title)
         axes = [figure.add_subplot(rows, columns, 1 + i) for i in range(panels)]
         _draw_return(axes[0], curves.get(RETURN), curves.get(EVALUATED))
-        named = {name for group in (counted, *relaxations.values()) for name in group}
+        named = {name for group in (counted, *groups.values()) for name in group}
         colors = dict(colors or constraint_colors(sorted(named)))
         _draw_violations(axes[1], counted, colors)
-        for panel, (heading, group) in zip(axes[2:], relaxations.items(), strict=False):
+        for panel, (heading, group) in zip(axes[2:], groups.items(), strict=False):
             panel.set_title(heading)
             _draw_by_constraint(panel, group, colors, "{:.3g}")
-        for panel, (name, curve) in zip(axes[2 + len(relaxations) :], others.items(), strict=True):
+        for panel, (name, curve) in zip(axes[2 + len(groups) :], others.items(), strict=True):
             panel.set_title(_title(name))
             _plot(panel, curve)
         for panel in axes:
@@ -125,7 +132,8 @@ def _title(name: str) -> str:
     group, _, last = name.rpartition("/")
     if group == "loss" and last != "entropy":
         return f"{_LOSSES.get(last, last)} loss"
-    return _TITLES.get(last, last.replace("_", " "))
+    title = _TITLES.get(last, last.replace("_", " "))
+    return f"{title} in an evaluation" if group == "evaluation" else title
 
 
 def _draw_return(axes: Axes, curve: Curve | None, evaluated: Curve | None) -> None:
@@ -141,7 +149,7 @@ def _draw_return(axes: Axes, curve: Curve | None, evaluated: Curve | None) -> No
 
 
 def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[str, str]) -> None:
-    axes.set_title("violations since the start")
+    axes.set_title("violations in training (steps)")
     if not counted:
         say(axes, "none counted")
         return

@@ -12,12 +12,12 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import counted_constraints, find_task_view
+from cnfp_torchrl.envs import action_components, counted_constraints, find_task_view
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.visual.colors import constraint_colors
-from cnfp_torchrl.visual.explanation import explain
+from cnfp_torchrl.visual.explanation import explain, unit_of
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.visual.figures.learning_curves import learning_curves, read_scalars
 from cnfp_torchrl.visual.figures.stages import flow_stages
@@ -67,11 +67,13 @@ def _figures(folder: RunFolder, config: DictConfig, episodes: int) -> dict[str, 
     colors = constraint_colors(names)
     run = f"{type(head.flow).__name__}, seed {config.seed}"
     curves = learning_curves(
-        read_scalars(folder.path / METRICS), colors=colors, title=f"Learning curves · {run}"
+        read_scalars(folder.path / METRICS),
+        colors=colors,
+        title=f"Learning curves · {run}",
+        unit=unit_of(action_components(env, head.action_dim)),
     )
     figures = {"learning_curves": curves}
-    view = find_task_view(env)
-    if view.map is not None:
+    if find_task_view(env).map is not None:
         figures["trajectories"] = _trajectories(_environment(config, episodes), actor, colors)
     if not head.flow.has_density:
         return figures  # the stages of a flow are drawn with their densities
@@ -83,7 +85,7 @@ def _figures(folder: RunFolder, config: DictConfig, episodes: int) -> dict[str, 
             title += "\nthe policy is saturated: samples of N(0, 1) in its place"
         if kind == "restrictive":
             snapshot = snapshot.following_the_longest_path()
-        figures[f"flow_{kind}"] = flow_stages(snapshot, view=view, colors=colors, title=title)
+        figures[f"flow_{kind}"] = flow_stages(snapshot, env=env, colors=colors, title=title)
     return figures
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from torch import Tensor
+from torchrl.envs import EnvBase
 
-from cnfp_torchrl.envs import NOTHING, TaskView
 from cnfp_torchrl.visual.colors import INK, MUTED
 from cnfp_torchrl.visual.figures.canvas import house_style, new_figure
 from cnfp_torchrl.visual.figures.map import AGENT, draw_moves, goal_entry, legend_entry
@@ -51,7 +51,7 @@ _NOT_APPLIED = (0, (1.2, 1.8))
 def flow_stages(
     snapshot: FlowSnapshot,
     *,
-    view: TaskView = NOTHING,
+    env: EnvBase | None = None,
     colors: Mapping[str, str] | None = None,
     title: str = "Flow stages",
     detail: Detail = PRINTED,
@@ -64,15 +64,17 @@ def flow_stages(
 
     Args:
         snapshot: The policy in the state.
-        view: The view: what the task shows of it; without a map its panel is left out.
+        env: The environment, which names the components of the action and may have a map; None:
+            neither.
         colors: The colors of the constraints; None chooses them by name.
         title: The title above the panels.
         detail: The fineness of what is drawn.
     """
-    scene = Scene(Setting.of(snapshot.head).holding(snapshot, view), snapshot, detail)
-    colors = dict(colors or scene.setting.colors)
+    setting = Setting.of(snapshot.head, env).holding(snapshot)
+    scene = Scene(setting, snapshot, detail)
+    colors = dict(colors or setting.colors)
     limits = Normalize(*density_limits(snapshot))
-    first = 0 if view.map is None else 1
+    first = 0 if setting.view.map is None else 1
     panels = first + 1 + len(snapshot.stages)
     rows = -(-panels // _COLUMNS)
     columns = -(-panels // rows)
@@ -86,14 +88,15 @@ def flow_stages(
             draw_moves(axes[0], scene, colors)
         draw_base(axes[first], snapshot, limits, detail.cells)
         axes[first].set_title("base\nz ~ N(μ, σ²)")
-        _name_axes(axes[first], snapshot.dim, "z", leftmost=True)
+        # What the base draws has no unit.
+        _name_axes(axes[first], [f"z of {part.name}" for part in setting.components])
         for i, panel in enumerate(axes[first + 1 :]):
             if snapshot.dim == 1:
                 _draw_line(panel, scene, i, colors)
             else:
                 _draw_plane(panel, scene, i, colors, limits)
             panel.set_title(_stage_title(snapshot, i))
-            _name_axes(panel, snapshot.dim, "a", leftmost=i == 0)
+            _name_axes(panel, [part.title for part in setting.components], leftmost=i == 0)
         if snapshot.dim > 1:
             bar = figure.colorbar(ScalarMappable(limits, DENSITY), ax=axes, shrink=0.75, aspect=28)
             bar.set_label("log-density (nats)")
@@ -268,11 +271,11 @@ def _draw_lines(axes: Axes, lines: list[Line], **style: Any) -> None:
         axes.plot(*line.T, **style)
 
 
-def _name_axes(axes: Axes, dim: int, symbol: str, *, leftmost: bool) -> None:
+def _name_axes(axes: Axes, titles: Sequence[str], *, leftmost: bool = True) -> None:
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel(f"${symbol}_1$" if dim > 1 else f"${symbol}$")
+    axes.set_xlabel(titles[0])
     if leftmost:
-        axes.set_ylabel(f"${symbol}_2$" if dim > 1 else "density")
+        axes.set_ylabel(titles[1] if len(titles) > 1 else "density")
 
 
 def _stage_title(snapshot: FlowSnapshot, index: int) -> str:

@@ -23,7 +23,7 @@ from cnfp_torchrl.visual.rerun.style import (
     series_path,
     stage_path,
 )
-from cnfp_torchrl.visual.setting import Setting, StageView, pair_name
+from cnfp_torchrl.visual.setting import Setting, StageView
 
 _STAGES_IN_LINE = 4
 _ROWS_AT_ONCE = 3
@@ -35,7 +35,7 @@ TRAINING_PLOTS: Mapping[str, Sequence[str]] = {
     "Training: losses": ["loss/**"],
     "Training: alpha": ["train/alpha"],
     "Training: entropy": ["train/entropy"],
-    "Training: violations": ["violations/**"],
+    "Training: violations so far (steps)": ["violations/**"],
     "Training: relaxed and dropped": ["relaxed/**", "dropped/**"],
     "Training: largest relaxation": ["relaxation/**"],
 }
@@ -97,7 +97,7 @@ def _stages(setting: Setting) -> rrb.Container:
     rows, pages = setting.rows(), []
     for first in range(0, len(rows), _ROWS_AT_ONCE):
         shown = rows[first : first + _ROWS_AT_ONCE]
-        name = " · ".join(pair_name(row[0].components) for row in shown)
+        name = " · ".join(setting.names(row[0].components) for row in shown)
         pages.append(rrb.Vertical(*(_row(setting, row) for row in shown), name=name))
     return pages[0] if len(pages) == 1 else rrb.Tabs(*pages)
 

@@ -11,7 +11,7 @@ from typing import Literal
 import rerun as rr
 
 from cnfp_torchrl.visual.colors import GOAL, rgb
-from cnfp_torchrl.visual.setting import Setting, StageView, pair_name
+from cnfp_torchrl.visual.setting import Setting, StageView
 
 TIMELINE = "env_step"
 PICTURE = "picture"
@@ -69,7 +69,7 @@ def stage_path(setting: Setting, view: StageView) -> str:
     """Return the path under which the entities of a stage's view lie."""
     parts = ["stages", f"{view.stage + 1} {setting.stages[view.stage]}"]
     if setting.dim > 2:
-        parts.append(pair_name(view.components))
+        parts.append(setting.names(view.components))
     return rr.new_entity_path(parts).strip("/")
 
 

@@ -69,7 +69,7 @@ def test_every_curve_is_drawn_as_logged(metrics: Path) -> None:
         found = any(np.array_equal(values, each) for each in drawn)
         assert found == (name != "train/steps_per_second"), name
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:2] == ["mean return of an episode", "violations since the start"]
+    assert titles[:2] == ["mean return of an episode", "violations in training (steps)"]
     assert {"critic loss", "actor loss", "policy entropy (nats)"} < set(titles)
     assert len(titles) == len(set(titles))
     assert draws(figure)
@@ -125,6 +125,25 @@ def test_how_constraints_gave_way_is_one_panel_each_where_they_did() -> None:
         "wall: 0.25",
         "power: 0",
     }
+
+
+def test_violations_in_evaluations_are_told_from_those_of_training() -> None:
+    steps = np.array([10.0, 20.0])
+    evaluated = {"wall": np.zeros(2), "power": np.array([3.0, 1.0])}
+    curves = {"violations/wall": (steps, np.array([5.0, 9.0])), "evaluation/score": (steps, steps)}
+    curves |= {f"evaluation/violations_{name}": (steps, v) for name, v in evaluated.items()}
+    _, training, evaluation, score = learning_curves(curves).axes
+    assert "training" in training.get_title()
+    for axes in (evaluation, score):
+        assert "evaluation" in axes.get_title()
+    legend = evaluation.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["wall: 0", "power: 1"]
+
+
+def test_relaxations_have_the_unit_of_the_action() -> None:
+    curves = {"relaxation/wall": (np.array([10.0]), np.array([0.5]))}
+    assert "(N m)" in learning_curves(curves, unit="N m").axes[2].get_title()
 
 
 def test_the_evaluations_stand_beside_the_training() -> None:

@@ -6,8 +6,11 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.path import Path as Polygon
+from torchrl.envs import EnvBase, TransformedEnv
 
+from cnfp_torchrl.envs import Component, ShowTask, TaskView
 from cnfp_torchrl.geometry import ConstraintSet
+from cnfp_torchrl.tasks.point_nav import PointNavEnv
 from cnfp_torchrl.visual import FlowSnapshot, constraint_colors
 from cnfp_torchrl.visual.figures import flow_stages
 from tests.pictures import draws
@@ -148,3 +151,29 @@ def test_followed_action_is_drawn_through_the_stages() -> None:
     for i, axes in enumerate(stage_panels(flow_stages(snapshot), snapshot)):
         (now,) = (line for line in axes.lines if line.get_marker() == "D")
         np.testing.assert_allclose(now.get_xydata(), path[i : i + 1])
+
+
+def env_of(*components: Component) -> EnvBase:
+    view = TaskView()
+    view.action_components = components
+    return TransformedEnv(PointNavEnv([]), ShowTask(view))
+
+
+@pytest.mark.parametrize("sets", [LINE, PLANE, SPACE])
+def test_axes_have_the_names_and_units_that_the_task_gives(sets: dict[str, ConstraintSet]) -> None:
+    snapshot = make_snapshot(sets, dim=next(iter(sets.values())).dim)
+    named = [Component("valve", "%/s"), Component("pan", "rad/s"), Component("grip")]
+    figure = flow_stages(snapshot, env=env_of(*named[: snapshot.dim]))
+    base = next(axes for axes in figure.axes if axes.get_title().startswith("base"))
+    panels = stage_panels(figure, snapshot)
+    assert base.get_xlabel() == "z of valve"
+    assert {axes.get_xlabel() for axes in panels} == {"valve (%/s)"}
+    assert panels[0].get_ylabel() == ("density" if snapshot.dim == 1 else "pan (rad/s)")
+    without = stage_panels(flow_stages(snapshot), snapshot)
+    assert without[0].get_xlabel() == "a1"
+
+
+def test_two_components_of_one_name_are_refused() -> None:
+    env = env_of(Component("joint", "rad"), Component("joint", "N m"))
+    with pytest.raises(ValueError, match=r"^action_components: .*'joint', 'joint'"):
+        flow_stages(make_snapshot(PLANE), env=env)
