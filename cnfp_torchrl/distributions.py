@@ -21,9 +21,9 @@ class NearestLogProb(NamedTuple):
     """Densities of the actions well inside that are nearest to given ones.
 
     Args:
-        log_prob: log-densities of the nearest actions, ``(*batch,)``.
-        action: nearest actions, ``(*batch, d)``.
-        moved: distances to the given actions, ``(*batch,)``, in action units; 0 for those that were
+        log_prob: Log-densities of the nearest actions, ``(*batch,)``.
+        action: Nearest actions, ``(*batch, d)``.
+        moved: Distances to the given actions, ``(*batch,)``, in action units; 0 for those that were
             well inside.
     """
 
@@ -44,10 +44,10 @@ class ConstrainedFlow(TransformedDistribution):
     was changed since, is the density of the draw, as from `rsample_and_log_prob`.
 
     Args:
-        base: distribution over R^d with ``event_shape (d,)``, of float32 or float64; expanded to
-            the batch shape of the bijector where that is larger, so that each set has samples of
+        base: The distribution over R^d with ``event_shape (d,)``, of float32 or float64; expanded
+            to the batch shape of the bijector where that is larger, so that each set has samples of
             its own.
-        bijector: bijector from R^d onto the allowed actions.
+        bijector: The bijector from R^d onto the allowed actions.
 
     Raises:
         ValueError: when the base is not a distribution over vectors of the bijector's dimension,
@@ -176,10 +176,10 @@ class ConstrainedFlow(TransformedDistribution):
             loss = -scored.log_prob.mean()
 
         Args:
-            value: actions ``(*sample, *batch, d)``, finite.
-            depth: share of the ray from the anchor to the boundary that is left ahead of an action,
-                between 0 and 1; at least about the square root of the dtype's rounding error, for
-                the density to be exact.
+            value: Actions ``(*sample, *batch, d)``, finite.
+            depth: The share of the ray from the anchor to the boundary that is left ahead of an
+                action, between 0 and 1; at least about the square root of the dtype's rounding
+                error, for the density to be exact.
 
         Raises:
             ValueError: for a depth outside of (0, 1), and for actions of another shape or dtype or

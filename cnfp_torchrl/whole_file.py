@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+_PARTIAL = ".{}.{}.partial"
+
 
 @contextmanager
 def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
@@ -25,7 +27,7 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
     Raises:
         FileExistsError: when exclusive and there is a file of this name.
     """
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    partial = path.with_name(_PARTIAL.format(path.name, secrets.token_hex(4)))
     try:
         with partial.open("xb") as file:
             yield file
@@ -37,6 +39,16 @@ def whole_file(path: Path, *, exclusive: bool = False) -> Iterator[BinaryIO]:
         else:
             partial.replace(path)
     finally:
+        partial.unlink(missing_ok=True)
+
+
+def remove_partial_files(path: Path) -> None:
+    """Remove what processes have left that were killed while they wrote a file.
+
+    Args:
+        path: The file's final name, or a pattern for several of one folder; nobody may be writing.
+    """
+    for partial in path.parent.glob(_PARTIAL.format(path.name, "?" * 8)):
         partial.unlink(missing_ok=True)
 
 

@@ -70,9 +70,9 @@ def policy_of(name: str, count: int, **options: Any) -> tuple[DeployedPolicy, tu
     """Return a policy whose constraint is a set of a family, and inputs of random sets of it.
 
     Args:
-        name: the family's name in `DIMENSIONS`.
-        count: number of states.
-        options: further arguments of `DeployedPolicy`.
+        name: The family's name in `DIMENSIONS`.
+        count: The number of states.
+        options: Further arguments of `DeployedPolicy`.
     """
     torch.manual_seed(0)
     dim = DIMENSIONS[name]

@@ -84,8 +84,8 @@ class Hostile:
     """A network that ignores learning and aims for trouble.
 
     Args:
-        mean: the latent mean.
-        scale: the latent scale.
+        mean: The latent mean.
+        scale: The latent scale.
         redrawn: ``step`` if the mean is evaluated at every step, ``episode`` if it is kept.
     """
 
@@ -135,13 +135,13 @@ class Row:
     """What one network did behind one flow.
 
     Args:
-        flow: name of the flow's configuration.
-        network: name of the network.
-        steps: environment steps.
-        violations: by constraint, as the environment counts them.
-        drops: states in which a constraint was inactive, by constraint.
-        minimum_anchor_slack: over all states, in action units.
-        seconds: how long it took.
+        flow: The name of the flow's configuration.
+        network: The name of the network.
+        steps: The environment steps.
+        violations: The violations by constraint, as the environment counts them.
+        drops: States in which a constraint was inactive, by constraint.
+        minimum_anchor_slack: The least slack of an anchor over all states, in action units.
+        seconds: How long it took.
     """
 
     flow: str

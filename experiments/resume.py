@@ -100,10 +100,10 @@ def killed_runs(root: Path, *, kills: int, steps: int, seed: int) -> Iterator[li
     """Yield a row for each killed run that has ended: its kills, and what differs.
 
     Args:
-        root: folder of the runs.
-        kills: number of kills in all.
-        steps: length of each run.
-        seed: seed of the moments.
+        root: The folder of the runs.
+        kills: The number of kills in all.
+        steps: The length of each run.
+        seed: The seed of the moments.
     """
     moments = random.Random(seed)
     before = _children_seconds()
@@ -132,9 +132,9 @@ def _is_killed(path: Path, steps: int, seconds: float = math.inf) -> bool:
     Not by the clock: on a busy machine every kill would come early.
 
     Args:
-        path: folder of the run.
-        steps: length of the run.
-        seconds: time of the processor, if the process has not ended before.
+        path: The folder of the run.
+        steps: The length of the run.
+        seconds: The time of the processor, if the process has not ended before.
     """
     settings = [f"hydra.run.dir={path}", f"collector.total_frames={steps}", *SETTINGS]
     arguments = [f"resume={path}"] if RunFolder(path).has_started else settings

@@ -9,12 +9,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import CatTensors, TransformedEnv
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from cnfp_torchrl import Ball, Box, constrain_env
+from cnfp_torchrl.envs import PreviousAction
 from cnfp_torchrl.modules import ConstraintBijector, make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.tasks.robots import RateLimit
 from cnfp_torchrl.training.networks import action_value_network, gaussian_network
 
 ORDER = ["battery", "obstacle"]
@@ -38,6 +40,14 @@ BIJECTORS = [ConstraintBijector("battery", Ball), ConstraintBijector("obstacle",
 def make_env(batch_size: tuple[int, ...] = (len(STATES),), **options: int) -> TransformedEnv:
     base = PointNavEnv(batch_size, seed=0, **options)
     return constrain_env(base, ObstacleGeometry(), BatteryGeometry(), order=ORDER)
+
+
+def make_rate_limited_env(batch_size: tuple[int, ...]) -> TransformedEnv:
+    """Return one whose network observes the previous action as the end of a vector of seven."""
+    env = TransformedEnv(PointNavEnv(batch_size, seed=0), PreviousAction())
+    parts = ["observation", "previous_action"]
+    env.append_transform(CatTensors(parts, "observation", del_keys=False, sort=False))
+    return constrain_env(env, RateLimit("rate", [0.2, 0.2]))
 
 
 @contextmanager

@@ -20,11 +20,11 @@ class Walls(EnvBase):
     """Shows a limit of each agent's first action component, the next one at each step.
 
     Args:
-        limits: the limits in turn; agent i begins with the i-th.
-        agents: the batch size.
-        unit: of actions and limits.
-        judged: names of the constraints with a column of ``cost``; none publishes no cost.
-        length: steps until an episode ends.
+        limits: The limits in turn; agent i begins with the i-th.
+        agents: The batch size.
+        unit: The unit of actions and limits.
+        judged: Names of the constraints with a column of ``cost``; none publishes no cost.
+        length: Steps until an episode ends.
     """
 
     def __init__(
@@ -76,8 +76,8 @@ class Wall(GeometryTransform):
     """First components of at most the limit that the state shows.
 
     Args:
-        name: the constraint's name.
-        unit: of actions and limits.
+        name: The constraint's name.
+        unit: The unit of actions and limits.
     """
 
     def __init__(self, name: str = "wall", unit: float = 1.0) -> None:

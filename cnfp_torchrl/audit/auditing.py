@@ -50,13 +50,14 @@ class AuditSettings:
     """The extent of an audit.
 
     Args:
-        states: number of states from each source.
-        actions: number of actions through the flow, and of uniform ones, in each state.
-        steps: length of the rollouts that states are taken from; more where copies need it.
-        uniform: also draw states uniformly, where the environment can be put into them.
-        examples: number of examples of each kind of flaw that are kept.
-        strict: count dead ends as flaws, for geometry that promises never to give way.
-        seed: seed of everything drawn.
+        states: The number of states from each source.
+        actions: The number of actions through the flow, and of uniform ones, in each state.
+        steps: The length of the rollouts that states are taken from; more where copies need it.
+        uniform: Whether to draw states uniformly, too, where the environment can be
+            put into them.
+        examples: The number of examples of each kind of flaw that are kept.
+        strict: Whether dead ends count as flaws, for geometry that promises never to give way.
+        seed: The seed of everything drawn.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -109,17 +110,17 @@ def audit(
     distributed, and normally where that is unbounded.
 
     Args:
-        env: the environment, which is reset. With a larger batch the audit is faster.
-        bijectors: bijectors, one for each constraint; None takes those of the geometry transforms.
-        order: the constraints' names in order of application, see
+        env: The environment, which is reset. With a larger batch the audit is faster.
+        bijectors: Bijectors, one for each constraint; None takes those of the geometry transforms.
+        order: The constraints' names in order of application, see
             `cnfp_torchrl.modules.ConstrainedFlowModule`.
-        flow: the flow, see `cnfp_torchrl.modules.ConstrainedFlowModule`.
-        actor: a constrained actor that acts in the rollouts, and whose flow is audited instead;
+        flow: The flow, see `cnfp_torchrl.modules.ConstrainedFlowModule`.
+        actor: A constrained actor that acts in the rollouts, and whose flow is audited instead;
             None takes safe random actions.
-        indicators: named indicators that judge a step; None takes the environment's ``cost``.
-        state_setter: function that puts the environment into given states; None takes that of the
-            environment's `cnfp_torchrl.envs.TaskView`, and copies environments without one.
-        settings: extent of the audit.
+        indicators: Named indicators that judge a step; None takes the environment's ``cost``.
+        state_setter: The function that puts the environment into given states; None takes that of
+            the environment's `cnfp_torchrl.envs.TaskView`, and copies environments without one.
+        settings: The extent of the audit.
 
     Raises:
         ValueError: when the environment publishes no geometry, or no indicator judges any of it,

@@ -25,11 +25,11 @@ class Distortion:
     alone has a = x there, and all singular values of da/dx are 1.
 
     Args:
-        moved: quantiles of how far allowed actions move, as a share of the way from the anchor to
+        moved: Quantiles of how far allowed actions move, as a share of the way from the anchor to
             the boundary on their ray.
-        smallest: quantiles of the smallest singular value of da/dx at allowed actions.
-        largest: quantiles of the largest one.
-        on_boundary: share of the float32 actions of standard normal latents that lie on the
+        smallest: Quantiles of the smallest singular value of da/dx at allowed actions.
+        largest: Quantiles of the largest one.
+        on_boundary: The share of the float32 actions of standard normal latents that lie on the
             region's boundary up to rounding, where many latents share one action.
     """
 
@@ -43,9 +43,9 @@ def measure_distortion(flow: Flow, region: Region, samples: int) -> Distortion:
     """Return the distortion of a safe flow, over random actions of some regions.
 
     Args:
-        flow: the flow.
-        region: regions of batch shape ``(n,)``, with finite bounds and an anchor.
-        samples: number of actions in each region.
+        flow: The flow.
+        region: Regions of batch shape ``(n,)``, with finite bounds and an anchor.
+        samples: The number of actions in each region.
     """
     exact = region.to(torch.float64)
     wished = allowed_actions(exact, samples)
@@ -76,8 +76,8 @@ def map_of_wishes(flow: Flow, region: Region) -> Map:
     """Return the map from wished actions in the bounds to actions: the flow without stage 0.
 
     Args:
-        flow: the flow.
-        region: regions, or a flow's region with finite bounds.
+        flow: The flow.
+        region: Regions, or a flow's region with finite bounds.
     """
     if isinstance(flow, RecessionFlow):
         return flow.of_actions(region)

@@ -32,9 +32,9 @@ class StepReader:
     """Reads indicators and active flags off a step.
 
     Args:
-        env: the environment.
-        head: the flow module, which knows the constraints.
-        indicators: named indicators; None takes the environment's ``cost``.
+        env: The environment.
+        head: The flow module, which knows the constraints.
+        indicators: Named indicators; None takes the environment's ``cost``.
 
     Raises:
         ValueError: when the environment publishes no cost, or of another shape than its names.
@@ -98,10 +98,10 @@ class StateSetterLookahead(Lookahead):
     """Puts the environment into each state again, as many at once as its batch holds.
 
     Args:
-        env: the environment.
-        state_setter: function that puts the environment into states.
-        states: the states ``(n,)``, as the environment returned them.
-        reader: what reads indicators and flags.
+        env: The environment.
+        state_setter: The function that puts the environment into states.
+        states: The states ``(n,)``, as the environment returned them.
+        reader: What reads indicators and flags.
 
     Raises:
         ValueError: by `outcome`, when the environment then shows another state.
@@ -138,8 +138,8 @@ class CopyLookahead(Lookahead):
     """Steps copies of the environment that were made while it stood in the states.
 
     Args:
-        copies: environments with their current states, of the environment's batch size.
-        reader: what reads indicators and flags.
+        copies: Environments with their current states, of the environment's batch size.
+        reader: What reads indicators and flags.
     """
 
     def __init__(self, copies: list[tuple[EnvBase, TensorDictBase]], reader: StepReader) -> None:

@@ -25,20 +25,21 @@ class _Subject:
     """The set of one constraint, or the intersection of all of them, as it is measured.
 
     Args:
-        name: the constraint's name, or `TOGETHER`.
-        judged: whether there is an indicator.
-        holds: mask of the states in which it is active, ``(n,)``.
-        had: mask of those in which it gives way by no more than a set without interior, ``(n,)``.
-        amount: amount by which it is relaxed, infinite where dropped, ``(n,)``; together the
+        name: The constraint's name, or `TOGETHER`.
+        judged: Whether there is an indicator.
+        holds: The mask of the states in which it is active, ``(n,)``.
+        had: The mask of those in which it gives way by no more than a set without interior,
+            ``(n,)``.
+        amount: The amount by which it is relaxed, infinite where dropped, ``(n,)``; together the
             largest one.
-        left: mask of the actions outside the set as it counts: widened where it is relaxed, and
+        left: The mask of the actions outside the set as it counts: widened where it is relaxed, and
             none where it is dropped, ``(2 m, n)``.
-        inside: mask of the actions in the set, ``(2 m, n)``.
-        reached: mask of the actions that count as covered, ``(2 m, n)``.
-        violated: mask of the actions that the indicator calls violations, ``(2 m, n)``.
-        kept: mask of the actions after which it is active, ``(2 m, n)``.
-        slack: slack of the actions, ``(2 m, n)``.
-        anchor_slack: slack of the anchor, ``(n,)``.
+        inside: The mask of the actions in the set, ``(2 m, n)``.
+        reached: The mask of the actions that count as covered, ``(2 m, n)``.
+        violated: The mask of the actions that the indicator calls violations, ``(2 m, n)``.
+        kept: The mask of the actions after which it is active, ``(2 m, n)``.
+        slack: The slack of the actions, ``(2 m, n)``.
+        anchor_slack: The slack of the anchor, ``(n,)``.
     """
 
     name: str
@@ -217,11 +218,11 @@ def executed(
     """Count the violations of rollouts, and those that allowed actions led into.
 
     Args:
-        rollouts: the rollouts.
-        reader: what reads indicators and flags.
-        head: the flow module.
-        keys: the entries of a state that identify it.
-        examples: number of examples to keep of each constraint.
+        rollouts: The rollouts.
+        reader: What reads indicators and flags.
+        head: The flow module.
+        keys: The entries of a state that identify it.
+        examples: The number of examples to keep of each constraint.
     """
     steps, agents = rollouts.ended.shape
     time = torch.arange(steps, device=rollouts.ended.device).unsqueeze(-1).expand(steps, agents)

@@ -23,28 +23,29 @@ class ConstraintMetrics:
     """Measurements of one constraint, or of all of them together, in one set of states.
 
     Args:
-        name: the constraint's name, or `TOGETHER`.
-        unsound: share of the actions inside its set, where it is active, that its indicator calls
-            a violation; None without an indicator.
-        escaped: share of the flow's samples that lie outside the set, widened where it is relaxed.
-        dead_ends: share, of the flow's samples that break nothing in states where everything is
+        name: The constraint's name, or `TOGETHER`.
+        unsound: The share of the actions inside its set, where it is active, that its indicator
+            calls a violation; None without an indicator.
+        escaped: The share of the flow's samples that lie outside the set, widened where it is
+            relaxed.
+        dead_ends: The share, of the flow's samples that break nothing in states where everything is
             active, of those that led to a state in which it gives way.
-        coverage: share of the actions that its indicator allows inside its set; together, of those
-            that the flow can reach. Where it is active.
-        binding: coverage in the states where the set leaves out any tried action.
-        relaxed: share of the states in which it is relaxed; together, in which one is and none is
-            dropped.
-        dropped: share of the states in which it is dropped; together, in which any is.
-        gave_way: share of the states in which it is either.
-        had: share of the states in which it is active, or relaxed by no more than a set without
+        coverage: The share of the actions that its indicator allows inside its set; together, of
+            those that the flow can reach. Where it is active.
+        binding: Coverage in the states where the set leaves out any tried action.
+        relaxed: The share of the states in which it is relaxed; together, in which one is and none
+            is dropped.
+        dropped: The share of the states in which it is dropped; together, in which any is.
+        gave_way: The share of the states in which it is either.
+        had: The share of the states in which it is active, or relaxed by no more than a set without
             interior needs (`cnfp_torchrl.geometry.relaxation_floor`).
-        relaxation: quantiles of the amount over the states in which it is relaxed, in units of its
+        relaxation: Quantiles of the amount over the states in which it is relaxed, in units of its
             slack; together of the largest one.
-        possible: share of the states in which it gives way in which some tried action keeps its
+        possible: The share of the states in which it gives way in which some tried action keeps its
             indicator for a step.
-        volume: quantiles of its share of the action bounds, over the states where it is active.
-        slack: quantiles of the anchor's slack, in action units, over the same states.
-        examples: states by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``gave_way``),
+        volume: Quantiles of its share of the action bounds, over the states where it is active.
+        slack: Quantiles of the anchor's slack, in action units, over the same states.
+        examples: States by kind of flaw (``unsound``, ``escaped``, ``dead_ends``, ``gave_way``),
             the worst ones first.
     """
 
@@ -70,14 +71,14 @@ class Executed:
     """Counts of what happened while the policy acted.
 
     Args:
-        steps: number of steps.
-        violations: number of violations by indicator, over all steps.
-        led_into: number of those in episodes in which the constraint had been active before:
+        steps: The number of steps.
+        violations: The number of violations by indicator, over all steps.
+        led_into: The number of those in episodes in which the constraint had been active before:
             allowed actions led from a state where it held to its violation.
-        examples: last states in which each constraint was active, with the action.
-        states: number of steps by constraint, then by what it was in their states, see
+        examples: The last states in which each constraint was active, with the action.
+        states: The number of steps by constraint, then by what it was in their states, see
             `CONSTRAINT_STATES`.
-        violations_while: number of violations by the same, of constraints with an indicator.
+        violations_while: The number of violations by the same, of constraints with an indicator.
     """
 
     steps: int
@@ -93,15 +94,15 @@ class WorstState:
     """The state that speaks most against a constraint's set, with every action tried in it.
 
     Args:
-        name: the constraint's name.
-        source: the state's source, such as ``rollouts``.
-        reason: words for what makes the state the worst one.
-        state: the state's entries.
-        region: sets, anchor and flags, of batch shape ``()``.
-        actions: the actions tried, ``(m, d)``.
-        inside: mask of the actions in the constraint's set, ``(m,)``.
-        violates: mask of the actions that the indicator calls violations, ``(m,)``.
-        dead_end: mask of the actions after which the constraint had to give way, ``(m,)``.
+        name: The constraint's name.
+        source: The state's source, such as ``rollouts``.
+        reason: The wording of what makes the state the worst one.
+        state: The state's entries.
+        region: Sets, anchor and flags, of batch shape ``()``.
+        actions: The actions tried, ``(m, d)``.
+        inside: The mask of the actions in the constraint's set, ``(m,)``.
+        violates: The mask of the actions that the indicator calls violations, ``(m,)``.
+        dead_end: The mask of the actions after which the constraint had to give way, ``(m,)``.
     """
 
     name: str
@@ -120,15 +121,15 @@ class AuditReport:
     """Everything that an audit found; as a string, tables and the verdict.
 
     Args:
-        subject: names of environment, flow and policy, and the settings.
-        sources: measurements by where the states came from, then constraint; the last one is
+        subject: Names of environment, flow and policy, and the settings.
+        sources: Measurements by where the states came from, then constraint; the last one is
             `TOGETHER`.
-        executed: counts of the rollouts.
-        order: the constraints in order of application.
-        notes: remarks on what the numbers leave out.
-        strict: flag that makes dead ends flaws.
-        worst_states: worst states, one for each constraint, for pictures; not part of `as_dict`.
-        distortion: what the flow does to allowed actions, by the states' source; empty for flows
+        executed: Counts of the rollouts.
+        order: The constraints in order of application.
+        notes: Remarks on what the numbers leave out.
+        strict: The flag that makes dead ends flaws.
+        worst_states: Worst states, one for each constraint, for pictures; not part of `as_dict`.
+        distortion: What the flow does to allowed actions, by the states' source; empty for flows
             that are not safe.
     """
 

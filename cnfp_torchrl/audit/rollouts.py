@@ -38,11 +38,11 @@ def roll_out(
     """Let a policy act, and keep every state.
 
     Args:
-        env: the environment, which is reset first.
-        policy: the policy.
-        reader: what reads indicators and flags.
-        steps: number of steps, over episodes.
-        copies: number of copies of the whole environment, at times drawn at random.
+        env: The environment, which is reset first.
+        policy: The policy.
+        reader: What reads indicators and flags.
+        steps: The number of steps, over episodes.
+        copies: The number of copies of the whole environment, at times drawn at random.
 
     Raises:
         TypeError: when copies are asked for and the environment cannot be copied with its state.

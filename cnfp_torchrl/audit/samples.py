@@ -30,15 +30,15 @@ class Samples:
     """Actions in n states, m from the flow and then m uniform ones, with what they lead to.
 
     Args:
-        head: the flow module.
-        states: the states, ``(n,)``.
-        keys: the entries of a state that identify it.
-        region: the sets, anchors and flags of the states.
-        actions: the actions, ``(2 m, n, d)``.
-        reachable: mask of the actions that the flow can reach, ``(2 m, n)``.
-        violated: mask of violations by constraint, False without an indicator, ``(2 m, n, K)``.
-        kept: mask of the constraints that are active in the next state, ``(2 m, n, K)``.
-        judged: flags of the constraints that have an indicator, K of them.
+        head: The flow module.
+        states: The states, ``(n,)``.
+        keys: The entries of a state that identify it.
+        region: The sets, anchors and flags of the states.
+        actions: The actions, ``(2 m, n, d)``.
+        reachable: The mask of the actions that the flow can reach, ``(2 m, n)``.
+        violated: The mask of violations by constraint, False without an indicator, ``(2 m, n, K)``.
+        kept: The mask of the constraints that are active in the next state, ``(2 m, n, K)``.
+        judged: Flags of the constraints that have an indicator, K of them.
     """
 
     head: ConstrainedFlowModule
@@ -92,11 +92,11 @@ def draw_samples(
     """Draw actions in every state, through the flow and uniformly, and look one step ahead.
 
     Args:
-        lookahead: the states, with a model of one step.
-        head: the flow module.
-        keys: the entries of a state that identify it.
-        indicators: the names of the indicators that judge steps.
-        actions: number of each kind in each state.
+        lookahead: The states, with a model of one step.
+        head: The flow module.
+        keys: The entries of a state that identify it.
+        indicators: The names of the indicators that judge steps.
+        actions: The number of each kind in each state.
     """
     states, bounds = lookahead.states, head.bounds
     bijector = head.get_bijector(states)

@@ -22,11 +22,11 @@ class Share:
     """A share of samples with a 95 % interval.
 
     Args:
-        count: number of hits.
-        of: number of samples.
+        count: The number of hits.
+        of: The number of samples.
         share: ``count / of``; None without samples.
-        low: lower end of the interval.
-        high: upper end of the interval.
+        low: The lower end of the interval.
+        high: The upper end of the interval.
     """
 
     count: int
@@ -44,8 +44,9 @@ class Share:
         agree on 0 or 1, the number of states counts.
 
         Args:
-            hits: number of hits in each cluster, ``(n,)``.
-            totals: number of samples of each cluster, ``(n,)``; empty clusters count for nothing.
+            hits: The number of hits in each cluster, ``(n,)``.
+            totals: The number of samples of each cluster, ``(n,)``; empty clusters count for
+                nothing.
         """
         hits, totals = hits[totals > 0].double(), totals[totals > 0].double()
         clusters, of = len(totals), int(totals.sum())

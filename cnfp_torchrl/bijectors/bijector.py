@@ -15,8 +15,8 @@ class Stages(NamedTuple):
     """The actions that a base sample is mapped to by the first stages of a bijector.
 
     Args:
-        actions: actions after each stage, ``(stages, *batch, d)``.
-        log_dets: log-determinants of the maps from the base sample to them, ``(stages, *batch)``.
+        actions: Actions after each stage, ``(stages, *batch, d)``.
+        log_dets: Log-determinants of the maps from the base sample to them, ``(stages, *batch)``.
     """
 
     actions: Tensor

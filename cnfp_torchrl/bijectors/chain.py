@@ -19,7 +19,7 @@ class SquashChain(Bijector):
     of the sets of those before it. `ExactSquash` guarantees all.
 
     Args:
-        bijectors: bijectors in order of application, the last one with the highest priority.
+        bijectors: Bijectors in order of application, the last one with the highest priority.
 
     Raises:
         ValueError: when there is no bijector.

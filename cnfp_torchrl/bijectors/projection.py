@@ -35,9 +35,9 @@ class Projection(Bijector):
     before the projection.
 
     Args:
-        region: regions of batch shape ``(*batch,)``, of any shipped family.
-        rounds: number of rounds of Dykstra's algorithm, >= 1.
-        validate_args: whether to check the action bounds, which reads them on the host.
+        region: Regions of batch shape ``(*batch,)``, of any shipped family.
+        rounds: The number of rounds of Dykstra's algorithm, >= 1.
+        validate_args: Whether to check the action bounds, which reads them on the host.
 
     Raises:
         ValueError: when there are no rounds.

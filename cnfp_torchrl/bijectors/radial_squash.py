@@ -21,8 +21,8 @@ class RadialSquash(Bijector):
     samples land near the boundary (`docs/method.md`, section 2).
 
     Args:
-        region: regions of batch shape ``(*batch,)``.
-        validate_args: whether to check the action bounds, which reads them on the host.
+        region: Regions of batch shape ``(*batch,)``.
+        validate_args: Whether to check the action bounds, which reads them on the host.
 
     Raises:
         GeometryError: when the action bounds are invalid.

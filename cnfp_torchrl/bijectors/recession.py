@@ -25,8 +25,12 @@ from cnfp_torchrl.geometry import (
 LEAST_MARGIN = 1e-2
 """The least sine of the angle between a way out and each row's boundary."""
 
-_STEPS = 64
-"""The steps of the search for a way out among more than two rows."""
+_STEPS, _CENTERING, _SHARE = 16, 0.05, 0.95
+"""Steps of the search for a way out among more than two rows: their number, the share of the
+products of weights and multipliers that each aims at, and of the way to the first that vanishes."""
+
+_RIDGE = 1e-13
+"""What is added to the squares of rows in that search, in float64."""
 
 _LARGEST_SOFT = 50.0
 """Beyond it softplus is the identity, in both dtypes."""
@@ -58,15 +62,16 @@ class Recession(Bijector):
     refused there, or without checks its actions are NaN.
 
     Args:
-        region: regions of batch shape ``(*batch,)``. Without an anchor, all sets but the bounds
+        region: Regions of batch shape ``(*batch,)``. Without an anchor, all sets but the bounds
             must be half-spaces, and the bounds infinite.
-        way_out: vectors r of any length, ``(*batch, d)``; None takes the one with the largest
+        way_out: Vectors r of any length, ``(*batch, d)``; None takes the one with the largest
             margin to all rows, minus the point of least length in the hull of their unit normals.
-        scale: scale s of the softness, in action units; with ``of_latents`` in units of latents.
-        sharpness: sharpness of the soft retraction.
-        of_latents: whether arguments are in units of the bounds, from -1 to 1, as those of a
+        scale: The scale s of the softness, in action units; with ``of_latents`` in units of
+            latents.
+        sharpness: The sharpness of the soft retraction.
+        of_latents: Whether arguments are in units of the bounds, from -1 to 1, as those of a
             Gaussian policy are, and not in action units.
-        validate_args: whether to check bounds and ways out, which reads them on the host.
+        validate_args: Whether to check bounds and ways out, which reads them on the host.
 
     Raises:
         ValueError: when scale or sharpness are out of range.
@@ -229,15 +234,15 @@ class _Rows(NamedTuple):
     away than the action can be broken.
 
     Args:
-        normals: outward unit normals, ``(*batch, m, d)``.
-        offsets: offsets, ``(*batch, m)``; a large number for rows that do not count, since the
+        normals: Outward unit normals, ``(*batch, m, d)``.
+        offsets: Offsets, ``(*batch, m)``; a large number for rows that do not count, since the
             gradient of infinity would be NaN.
-        back: unit vectors -r, ``(*batch, d)``.
-        rates: how fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
-        stretch: how much longer the way is than it must be, as a share, ``(*batch,)``; NaN where
+        back: Unit vectors -r, ``(*batch, d)``.
+        rates: How fast the way leads away from each row, :math:`-A_k r`, ``(*batch, m)``.
+        stretch: How much longer the way is than it must be, as a share, ``(*batch,)``; NaN where
             there is no way out and no anchor either.
-        has_way_out: where there is a way out, boolean ``(*batch,)``.
-        magnitude: the size of points that offsets are eroded for, ``(*batch, 1)``; None is 0.
+        has_way_out: Where there is a way out, boolean ``(*batch,)``.
+        magnitude: The size of points that offsets are eroded for, ``(*batch, 1)``; None is 0.
     """
 
     normals: Tensor
@@ -258,9 +263,9 @@ class _Rows(NamedTuple):
         """Return the rows of sets, each with where it is not dropped (None: everywhere).
 
         Args:
-            sets: half-spaces.
-            way_out: vectors r of any length, ``(*batch, d)``; None finds one.
-            magnitude: the size of points, ``(*batch,)``. None is 0, for a region without an anchor,
+            sets: Half-spaces.
+            way_out: Vectors r of any length, ``(*batch, d)``; None finds one.
+            magnitude: The size of points, ``(*batch,)``. None is 0, for a region without an anchor,
                 where actions are NaN if there is no way out, and not left as they are.
         """
         normals, offsets = _unit_rows(sets)
@@ -311,8 +316,8 @@ class _Rows(NamedTuple):
         """Return how far to go along the way out until all rows hold, negative if they do.
 
         Args:
-            point: points ``(*batch, d)``.
-            wished: the actions that rows are eroded for, ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
+            wished: The actions that rows are eroded for, ``(*batch, d)``.
         """
         size = wished.detach().abs().amax(-1, keepdim=True)
         if self.magnitude is not None:
@@ -363,50 +368,55 @@ def hull_point(normals: Tensor, binds: Tensor) -> Tensor:
     that decide. Where the hull contains 0 nothing leads away from all rows.
 
     Args:
-        normals: unit normals, ``(*batch, m, d)``.
-        binds: which rows count, boolean ``(*batch, m)``.
+        normals: Unit normals, ``(*batch, m, d)``.
+        binds: Which rows count, boolean ``(*batch, m)``.
     """
     if normals.shape[-2] <= 2:
         # The point of least length between two unit vectors is their middle.
         return (normals * binds.unsqueeze(-1)).sum(-2)
     rows = normals.double() * binds.unsqueeze(-1)
-    gram = rows @ rows.mT
-    weights = _least_length_weights(gram.detach(), binds)
-    deciding = weights > 1e-6
-    both = deciding.unsqueeze(-1) & deciding.unsqueeze(-2)
     identity = torch.eye(rows.shape[-2], dtype=rows.dtype, device=rows.device)
-    # A small multiple of the identity, for rows that are equal.
-    system = torch.where(both, gram, 0) + identity * torch.where(deciding, 1e-13, 1.0).unsqueeze(-1)
-    solved = torch.linalg.solve(system, deciding.double())
+    # With a small multiple of the identity, for rows that are equal.
+    gram = rows @ rows.mT + _RIDGE * identity
+    deciding = _deciding_rows(gram.detach(), binds)
+    both = deciding.unsqueeze(-1) & deciding.unsqueeze(-2)
+    solved = torch.linalg.solve(torch.where(both, gram, identity), deciding.double())
     return (rows * solved.unsqueeze(-1)).sum(-2).to(normals.dtype)
 
 
 @torch.no_grad()
-def _least_length_weights(gram: Tensor, binds: Tensor) -> Tensor:
-    """Return the weights of the point of least length in a hull, by pairwise steps.
+def _deciding_rows(gram: Tensor, binds: Tensor) -> Tensor:
+    """Return which rows the point of least length in a hull lies between, boolean ``(*batch, m)``.
 
-    Weight goes from the row that the point is furthest along to the one it is least along, as much
-    as shortens it most (the algorithm of Mitchell, Demyanov and Malozemov, 1974).
+    Minimizes the point's square over weights w >= 0 of sum 1, with a multiplier s >= 0 for each
+    row, by primal-dual interior-point steps (Wright 1997): in the end w is far above s for rows
+    that decide, and far below for the others.
 
     Args:
-        gram: products of all rows, ``(*batch, m, m)``.
-        binds: which rows count, boolean ``(*batch, m)``.
+        gram: Products of all rows, ``(*batch, m, m)``.
+        binds: Which rows count, boolean ``(*batch, m)``; rows that do not are zero.
     """
-    weights = binds.double()
-    weights = weights / weights.sum(-1, keepdim=True).clamp(min=1)
+    # A row that does not count would be the shortest point; it costs more than any other can.
+    cost = torch.where(binds, 0.0, 4.0).to(gram.dtype)
+    weights = torch.full_like(cost, 1 / cost.shape[-1])
+    slopes = (gram @ weights.unsqueeze(-1)).squeeze(-1) + cost
+    multipliers = slopes - slopes.amin(-1, keepdim=True) + 1
     for _ in range(_STEPS):
-        along = (gram @ weights.unsqueeze(-1)).squeeze(-1)
-        to = along.masked_fill(~binds, torch.inf).argmin(-1, keepdim=True)
-        since = along.masked_fill(weights <= 0, -torch.inf).argmax(-1, keepdim=True)
-        change = along.gather(-1, since) - along.gather(-1, to)
-        diagonal = gram.diagonal(dim1=-2, dim2=-1)
-        cross = gram.gather(-2, since.unsqueeze(-1).expand(*since.shape[:-1], 1, gram.shape[-1]))
-        cross = cross.squeeze(-2).gather(-1, to)
-        length = diagonal.gather(-1, since) + diagonal.gather(-1, to) - 2 * cross
-        step = torch.where(length > 0, change / length, 0).clamp(min=0)
-        step = torch.minimum(step, weights.gather(-1, since))
-        weights = weights.scatter_add(-1, to, step).scatter_add(-1, since, -step)
-    return weights
+        ratios = multipliers / weights
+        target = _CENTERING * (weights * multipliers).mean(-1, keepdim=True)
+        change = target / weights - multipliers
+        factor, _ = torch.linalg.cholesky_ex(gram + torch.diag_embed(ratios))
+        both = torch.stack([change, torch.ones_like(change)], -1)
+        free, uniform = torch.cholesky_solve(both, factor).unbind(-1)
+        # The weights' sum stays 1.
+        uniform = uniform * (free.sum(-1, keepdim=True) / uniform.sum(-1, keepdim=True))
+        weights_change = free - uniform
+        multipliers_change = change - ratios * weights_change
+        shrinks = torch.cat([weights_change / weights, multipliers_change / multipliers], -1)
+        step = (_SHARE / -shrinks.amin(-1, keepdim=True).clamp(max=-_SHARE)).clamp(max=1)
+        weights = weights + step * weights_change
+        multipliers = multipliers + step * multipliers_change
+    return weights > multipliers
 
 
 def softened(need: Tensor) -> Tensor:

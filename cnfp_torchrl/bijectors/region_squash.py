@@ -47,8 +47,8 @@ class ExactSquash(Bijector):
     with zero tolerance.
 
     Args:
-        region: regions of batch shape ``(*batch,)``.
-        validate_args: whether to check the action bounds, which reads them on the host.
+        region: Regions of batch shape ``(*batch,)``.
+        validate_args: Whether to check the action bounds, which reads them on the host.
 
     Raises:
         GeometryError: when the action bounds are invalid.
@@ -154,8 +154,8 @@ class _Retraction:
         """Return the action and the log-determinant of the map from the latent to it.
 
         Args:
-            offset: offsets within the action bounds, ``(*batch, d)``.
-            log_slopes: log-derivatives of the offset in the latent by component, ``(*batch, d)``.
+            offset: Offsets within the action bounds, ``(*batch, d)``.
+            log_slopes: Log-derivatives of the offset in the latent by component, ``(*batch, d)``.
         """
         scaled, contraction, factors = self._scaled_and_contraction(offset)
         if factors is not None:
@@ -236,9 +236,9 @@ def contraction_along_rays(offset: Tensor, outer_gauge: Tensor, inner: Sequence[
     constraint must not pass for one that does not bind.
 
     Args:
-        offset: points of the outer set minus the anchor, v, ``(*batch, d)``.
-        outer_gauge: gauge of the outer set at the offset, ``(*batch,)``.
-        inner: gauges of one or more inner sets about the anchor.
+        offset: Points of the outer set minus the anchor, v, ``(*batch, d)``.
+        outer_gauge: The gauge of the outer set at the offset, ``(*batch,)``.
+        inner: Gauges of one or more inner sets about the anchor.
     """
     # In one dimension a direction is a sign, without a gradient. The exact zero would be computed
     # as rounding error over length.

@@ -17,11 +17,11 @@ class Retraction(Bijector):
     :math:`\log|\det| = -d \log r`.
 
     Args:
-        outer: set that arguments lie in, bounded in every direction. It is not eroded here, because
-            a squash onto it has left a margin already. An argument beyond it by a rounding error
-            would leave the inner set by the same share of the distance to the boundary.
-        inner: set to retract into; it is eroded here.
-        anchor: points strictly inside both sets, ``(*batch, d)``.
+        outer: The set that arguments lie in, bounded in every direction. It is not eroded here,
+            because a squash onto it has left a margin already. An argument beyond it by a rounding
+            error would leave the inner set by the same share of the distance to the boundary.
+        inner: The set to retract into; it is eroded here.
+        anchor: Points strictly inside both sets, ``(*batch, d)``.
     """
 
     def __init__(self, outer: ConstraintSet, inner: ConstraintSet, anchor: Tensor) -> None:

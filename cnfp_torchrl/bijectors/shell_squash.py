@@ -32,13 +32,13 @@ class ShellSquash(Bijector):
     action jumps there, and the log-determinant grows like :math:`-(d - 1) \log \rho`.
 
     Args:
-        center: centers m, ``(*batch, d)``.
-        inner: radii of the hole, ``(*batch,)``.
-        outer: outer radii, ``(*batch,)``.
-        region: regions of further sets that actions must satisfy, with m as the anchor. They must
+        center: Centers m, ``(*batch, d)``.
+        inner: Radii of the hole, ``(*batch,)``.
+        outer: Outer radii, ``(*batch,)``.
+        region: Regions of further sets that actions must satisfy, with m as the anchor. They must
             reach beyond the hole along every ray; a ray on which they do not gives NaN, which
             environments refuse.
-        validate_args: whether to check the arguments, which reads them on the host.
+        validate_args: Whether to check the arguments, which reads them on the host.
 
     Raises:
         GeometryError: unless 0 < inner < outer, both finite, with room between them for the dtype.

@@ -50,13 +50,13 @@ class SoftRetraction(Bijector):
     :math:`G(v) < 10^{37}`.
 
     Args:
-        region: regions of batch shape ``(*batch,)``; they are eroded here. Their bounds may be
+        region: Regions of batch shape ``(*batch,)``; they are eroded here. Their bounds may be
             infinite (`Region.with_finite_bounds`).
-        outer: convex sets that arguments lie in, not eroded here and bounded or not, with the
+        outer: Convex sets that arguments lie in, not eroded here and bounded or not, with the
             anchor strictly inside; None is R^d.
-        sharpness: sharpness p, from 1 to `MOST_SHARP`.
-        by_components: whether boxes retract by components; never about an outer set that is no box.
-        validate_args: whether to check that bounds leave room in the dtype, which reads them.
+        sharpness: The sharpness p, from 1 to `MOST_SHARP`.
+        by_components: Whether boxes retract by components; never about an outer set that is no box.
+        validate_args: Whether to check that bounds leave room in the dtype, which reads them.
 
     Raises:
         ValueError: when the sharpness is out of range.
@@ -121,10 +121,10 @@ class SoftSquash(ExactSquash):
     density has a limit there, which that of `ExactSquash` has not.
 
     Args:
-        region: regions of batch shape ``(*batch,)``.
-        sharpness: sharpness p, from 1 to `MOST_SHARP`.
-        by_components: whether boxes retract by components, not along the ray.
-        validate_args: whether to check the action bounds, which reads them on the host.
+        region: Regions of batch shape ``(*batch,)``.
+        sharpness: The sharpness p, from 1 to `MOST_SHARP`.
+        by_components: Whether boxes retract by components, not along the ray.
+        validate_args: Whether to check the action bounds, which reads them on the host.
 
     Raises:
         ValueError: when the sharpness is out of range.
@@ -153,11 +153,11 @@ class SoftContraction:
     """The soft retraction of offsets from an anchor onto actions.
 
     Args:
-        outer: the outer set's box of offsets, or its gauge of offsets; None is R^d.
-        boxes: boxes that retract each component by itself; none if the outer set is a gauge.
-        others: sets that retract along the ray.
-        anchor: points strictly inside all sets, ``(*batch, d)``.
-        sharpness: sharpness p.
+        outer: The outer set's box of offsets, or its gauge of offsets; None is R^d.
+        boxes: Boxes that retract each component by itself; none if the outer set is a gauge.
+        others: Sets that retract along the ray.
+        anchor: Points strictly inside all sets, ``(*batch, d)``.
+        sharpness: The sharpness p.
     """
 
     def __init__(
@@ -195,8 +195,8 @@ class SoftContraction:
         """Return the action and the log-determinant of the map from the latent to it.
 
         Args:
-            offset: offsets within the outer set, ``(*batch, d)``.
-            log_slopes: log-derivatives of the offset in the latent by component, ``(*batch, d)``.
+            offset: Offsets within the outer set, ``(*batch, d)``.
+            log_slopes: Log-derivatives of the offset in the latent by component, ``(*batch, d)``.
         """
         p, log_det = self._sharpness, log_slopes.sum(-1)
         if self._box_sides is not None:
@@ -259,9 +259,9 @@ def soft_factor(progress: Tensor | None, gauge: Tensor, sharpness: float) -> tup
     is that of a division by G, to a few rounding errors, whatever p is.
 
     Args:
-        progress: gauge of the outer set, at most 1 up to rounding error; None is 0.
-        gauge: gauge of the inner set, at least as large as the progress.
-        sharpness: sharpness p.
+        progress: The gauge of the outer set, at most 1 up to rounding error; None is 0.
+        gauge: The gauge of the inner set, at least as large as the progress.
+        sharpness: The sharpness p.
     """
     one = torch.ones_like(gauge)
     below, above = torch.minimum(gauge, one), torch.maximum(gauge, one)

@@ -49,9 +49,9 @@ class BoxSquash(Bijector):
     saturated action satisfies the bounds with zero tolerance. Source: paper, section Method.
 
     Args:
-        low: lower bounds ``(*batch, d)``.
-        high: upper bounds ``(*batch, d)``.
-        validate_args: whether to check the bounds, which reads them on the host.
+        low: Lower bounds ``(*batch, d)``.
+        high: Upper bounds ``(*batch, d)``.
+        validate_args: Whether to check the bounds, which reads them on the host.
 
     Raises:
         GeometryError: when a bound is not finite, low >= high, or bounds are closer than rounding
@@ -151,9 +151,9 @@ class BallSquash(_UnitBallImage):
     eroded by rounding error. Source: paper, section Method.
 
     Args:
-        center: centers m, ``(*batch, d)``.
-        radius: radii r, ``(*batch,)``.
-        validate_args: whether to check the arguments, which reads them on the host.
+        center: Centers m, ``(*batch, d)``.
+        radius: Radii r, ``(*batch,)``.
+        validate_args: Whether to check the arguments, which reads them on the host.
 
     Raises:
         GeometryError: when the radius is not positive and finite, or nothing is left of the ball
@@ -185,9 +185,9 @@ class EllipsoidSquash(_UnitBallImage):
     ellipsoid eroded by rounding error. Source: paper, section Method.
 
     Args:
-        center: centers m, ``(*batch, d)``.
-        scale_tril: matrices T, lower triangular with positive diagonals, ``(*batch, d, d)``.
-        validate_args: whether to check the arguments, which reads them on the host.
+        center: Centers m, ``(*batch, d)``.
+        scale_tril: Matrices T, lower triangular with positive diagonals, ``(*batch, d, d)``.
+        validate_args: Whether to check the arguments, which reads them on the host.
 
     Raises:
         GeometryError: when T is not lower triangular with a positive diagonal, or nothing is left
@@ -282,9 +282,9 @@ def radial_log_det(q: Tensor, dim: int, unit: Tensor | float = 1.0) -> Tensor:
     :math:`L(\rho) + (d - 1) \log(\tanh(\rho)/\rho)` at :math:`\rho = |z|`.
 
     Args:
-        q: squared lengths :math:`|z/u|^2`, ``(*batch,)``.
-        dim: dimension d.
-        unit: units u >= 1 of the lengths, ``(*batch,)``; 1 where q < `SMALL`.
+        q: Squared lengths :math:`|z/u|^2`, ``(*batch,)``.
+        dim: The dimension d.
+        unit: Units u >= 1 of the lengths, ``(*batch,)``; 1 where q < `SMALL`.
     """
     small = q < SMALL
     near_q = torch.where(small, q, 0.0)

@@ -18,8 +18,8 @@ def reach(bijector: Bijector, action: Tensor) -> tuple[Tensor, Tensor]:
     images of this package's bijectors are star-shaped about it.
 
     Args:
-        bijector: bijector with the image.
-        action: actions ``(*batch, d)``, finite, inside the image or outside.
+        bijector: The bijector with the image.
+        action: Actions ``(*batch, d)``, finite, inside the image or outside.
 
     Returns:
         The origin ``(*batch, d)``, and the share ``(*batch,)`` of the line from it to the action
@@ -41,9 +41,9 @@ def well_inside(bijector: Bijector, action: Tensor, depth: float) -> Tensor:
     """Return actions pulled towards the origin of `reach`, if they are too near the boundary.
 
     Args:
-        bijector: bijector whose image the actions are pulled into.
-        action: actions ``(*batch, d)``, finite.
-        depth: share of the ray from the origin to the boundary that is left ahead of an action.
+        bijector: The bijector whose image the actions are pulled into.
+        action: Actions ``(*batch, d)``, finite.
+        depth: The share of the ray from the origin to the boundary that is left ahead of an action.
     """
     origin, share = reach(bijector, action)
     kept = ((1 - depth) * share).clamp(max=1).unsqueeze(-1)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import GeometryTransform
+from cnfp_torchrl.envs import GeometryTransform, observed_entries, refuse_changed_inputs
 from cnfp_torchrl.geometry import Box, ConstraintSet, Region, attempt_anchor, row_depths
 from cnfp_torchrl.keys import ANCHOR_KEY, CONSTRAINTS_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
@@ -91,9 +91,9 @@ class DeployedPolicy(nn.Module):
         self.bijectors: Any = nn.ModuleList(head.bijectors)
         self.parameter_keys, self.action_dtype = head.parameter_keys, head.action_dtype
         self.bounds = ActionBounds(head.bounds)
-        self.input_keys = self._input_keys()
-        _refuse_changed_inputs(env, self.input_keys)
-        self.inputs = env.observation_spec.zero().reshape(-1)[:1].select(*self.input_keys)
+        self.entries = observed_entries(env, self._read_keys())
+        self.inputs = {leaf.key: leaf.spec for entry in self.entries for leaf in entry.leaves()}
+        refuse_changed_inputs(env, self.input_keys)
         self.fallback = None if fallback is None else self._checked_fallback(fallback)
         self.eval()
 
@@ -102,10 +102,14 @@ class DeployedPolicy(nn.Module):
         """The shape of the noise for one state, ``(d,)``."""
         return (self.bounds.dim,)
 
+    @property
+    def input_keys(self) -> list[NestedKey]:
+        """The keys of what is observed: of a vector that `CatTensors` makes, its parts."""
+        return list(self.inputs)
+
     def examples(self, batch: int) -> tuple[Tensor, ...]:
         """Return inputs of a batch size, zeros."""
-        inputs = [self.inputs.get(key) for key in self.input_keys]
-        zeros = [value.new_zeros(batch, *value.shape[1:]) for value in inputs]
+        zeros = [spec.expand(batch, *spec.shape).zero() for spec in self.inputs.values()]
         if self.stochastic:
             zeros.append(torch.zeros(batch, *self.noise_shape, dtype=self.action_dtype))
         return tuple(zeros)
@@ -144,8 +148,9 @@ class DeployedPolicy(nn.Module):
     def states(self, *inputs: Tensor) -> TensorDictBase:
         """Return the states with the geometry that is published in them, unchecked."""
         states = TensorDict({}, batch_size=inputs[0].shape[:1])
-        for key, value in zip(self.input_keys, inputs, strict=False):
-            states.set(key, value)
+        observed = dict(zip(self.inputs, inputs, strict=False))
+        for entry in self.entries:
+            states.set(entry.key, entry.value(lambda e: None if e.parts else observed[e.key]))
         for geometry in self.geometries:
             for key, value in geometry.entries(states).items():
                 states.set(key, value)
@@ -182,7 +187,7 @@ class DeployedPolicy(nn.Module):
             )
         return action
 
-    def _input_keys(self) -> list[NestedKey]:
+    def _read_keys(self) -> list[NestedKey]:
         """Return what geometries and network read and nothing in the graph writes."""
         keys: list[NestedKey] = []
         for geometry in self.geometries:
@@ -204,20 +209,6 @@ def _geometries(env: EnvBase, order: Sequence[str]) -> list[GeometryTransform]:
             f"{sorted(missing)}"
         )
     return [transform for transform in found if transform.name in order]
-
-
-def _refuse_changed_inputs(env: EnvBase, keys: Sequence[NestedKey]) -> None:
-    """Refuse transforms by which geometry and network read other values under the same key."""
-    behind = False
-    for transform in appended_transforms(env):
-        behind = behind or isinstance(transform, GeometryTransform)
-        changed = [key for key in transform.out_keys if key in keys]
-        if behind and changed and not isinstance(transform, GeometryTransform):
-            raise ValueError(
-                f"env: expected no transform that changes {changed} behind the geometries, which "
-                f"read them, given {type(transform).__name__}; put it into the environment that is "
-                "constrained, or into the network"
-            )
 
 
 def _are_deep(sets: Sequence[ConstraintSet], anchor: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
@@ -39,7 +40,10 @@ def observed_states(
     ]
     visited: Any = torch.cat(rollouts)
     chosen = visited[torch.randperm(len(visited))[:count]]
-    return tuple(chosen.get(key).contiguous() for key in policy.input_keys)
+    observed: dict[NestedKey, Tensor] = {}
+    for entry in policy.entries:
+        observed |= entry.split(chosen.get(entry.key))
+    return tuple(observed[key].contiguous() for key in policy.input_keys)
 
 
 @torch.no_grad()

@@ -13,6 +13,11 @@ from cnfp_torchrl.envs.cost import (
     refuse_misnamed_judges,
 )
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.observed import (
+    ObservedEntry,
+    observed_entries,
+    refuse_changed_inputs,
+)
 from cnfp_torchrl.envs.packed_states import PackedStates
 from cnfp_torchrl.envs.penalty import RewardPenalty
 from cnfp_torchrl.envs.previous_action import PreviousAction
@@ -59,6 +64,7 @@ __all__ = [
     "Indicator",
     "Map",
     "Marks",
+    "ObservedEntry",
     "PackedStates",
     "Polyline",
     "PreviousAction",
@@ -82,6 +88,8 @@ __all__ = [
     "environment_layers",
     "find_task_view",
     "numbered_components",
+    "observed_entries",
+    "refuse_changed_inputs",
     "refuse_misnamed_judges",
     "require_names",
 ]

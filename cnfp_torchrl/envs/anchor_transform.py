@@ -64,8 +64,8 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         bijectors: One for each constraint; they know where the geometry lies.
         order: The constraints' names in order of application, the last with the highest priority;
             None takes the bijectors' own order. The same as the flow's.
-        leeway: by how much relaxed constraints give way beyond the least amount, as a share of the
-            smallest width of the action bounds.
+        leeway: The amount by which relaxed constraints give way beyond the least amount, as a share
+            of the smallest width of the action bounds.
         compile: Whether the geometries right before this transform, their checks and the cheap part
             of the anchor are compiled into one function (`torch.compile`), which steps use; resets
             do without. `constraint_set` must then read the entries of its `in_keys` alone.
@@ -137,9 +137,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
 
     def _take_over(self) -> StepGeometry:
         """From now on publish in one pass what the geometries right before this transform do."""
-        appended = appended_transforms(self.container)
-        before = reversed(list(takewhile(lambda transform: transform is not self, appended)))
-        geometries = list(takewhile(lambda t: isinstance(t, GeometryTransform), before))[::-1]
+        geometries = self._geometries_before()
         for geometry in geometries:
             geometry.is_published_by_another = True
         known, bounds = self._known_geometry, self._action_bounds()
@@ -148,23 +146,40 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
         self._geometry = self._known_geometry = known
         return known
 
+    def publishes_for(self, other: ConstraintPublisher) -> bool:
+        """Tell whether another transform can leave it to this one to publish its constraint."""
+        # All geometries or none, as one may read what another publishes.
+        geometries = self._geometries_before()
+        return other in geometries and all(g.is_published_by_another for g in geometries)
+
+    def _geometries_before(self) -> list[GeometryTransform]:
+        """Return the geometries right before this transform, in order."""
+        appended = appended_transforms(self.container)
+        before = reversed(list(takewhile(lambda transform: transform is not self, appended)))
+        return list(takewhile(lambda t: isinstance(t, GeometryTransform), before))[::-1]
+
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._refuse_unseen_steps()
         self._refuse_misfit_of_collector()
-        self._geometry = None
+        left = [g for g in self._geometries_before() if g.is_published_by_another]
+        self._geometry = StepGeometry(left, self._bijectors, self._action_bounds())
         reset = self._call(tensordict_reset)
         self._take_over()
         return reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Fill in anchor and flags of stored transitions, at root and under next."""
-        # In a replay buffer the geometries publish their sets themselves.
-        self._geometry = None
-        self._call(tensordict)
-        if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
-            self._call(tensordict.get("next"))
+        # In a replay buffer the geometries publish their sets themselves. An environment may be in
+        # the middle of an episode, and goes on as before.
+        before, self._geometry = self._geometry, None
+        try:
+            self._call(tensordict)
+            if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
+                self._call(tensordict.get("next"))
+        finally:
+            self._geometry = before
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

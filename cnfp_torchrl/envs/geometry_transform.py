@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -29,7 +29,12 @@ from cnfp_torchrl.keys import (
     refuse_non_finite,
     refuse_string,
 )
-from cnfp_torchrl.modules import ConstraintBijector, ConstraintPublisher, action_bounds
+from cnfp_torchrl.modules import (
+    ConstraintBijector,
+    ConstraintPublisher,
+    action_bounds,
+    appended_transforms,
+)
 
 
 class GeometryTransform(Transform, ConstraintPublisher):
@@ -83,7 +88,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     _family: type[ConstraintSet] | None = None
     _is_compared = False
     is_published_by_another = False
-    """Whether a transform behind this one publishes the set, until the next reset."""
+    """Whether a transform behind this one publishes the set, in the environment's steps."""
     _valid_shapes: list[tuple[torch.Size, torch.dtype]] | None = None
 
     def __init__(
@@ -257,10 +262,14 @@ class GeometryTransform(Transform, ConstraintPublisher):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Publish at the root and, where it exists, under ``next``: for use in a replay buffer."""
-        self.is_published_by_another = False
-        self._call(tensordict)
-        if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
-            self._call(tensordict.get("next"))
+        # An environment may be in the middle of an episode, and goes on as before.
+        before, self.is_published_by_another = self.is_published_by_another, False
+        try:
+            self._call(tensordict)
+            if "next" in tensordict.keys():  # noqa: SIM118 - a tensordict iterates over its batch
+                self._call(tensordict.get("next"))
+        finally:
+            self.is_published_by_another = before
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -272,7 +281,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
             found = evidence([check])
             values = torch.stack([each.value for each in found]).tolist() if found else []
             if not are_within(values, (each.limit for each in found)):
-                check.refuse()
+                refuse_values([check])
         if not self._is_compared and next_tensordict.numel() > 1:
             self._refuse_what_follows_the_batch(next_tensordict, allowed)
             self._is_compared = True
@@ -317,7 +326,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def check(self, states: TensorDictBase, allowed: ConstraintSet) -> Check:
         """Return what is to be checked of some states and their `checked_set`."""
         inputs = {key: states.get(key) for key in self.in_keys}
-        return Check(inputs, allowed, partial(self._refuse_values, states, allowed))
+        return Check(self.name, inputs, allowed, partial(self._refuse_values, states, allowed))
 
     def _refuse_values(self, states: TensorDictBase, allowed: ConstraintSet) -> None:
         self._refuse_what_is_not_finite(states)
@@ -336,7 +345,11 @@ class GeometryTransform(Transform, ConstraintPublisher):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self.is_published_by_another = False
+        if self.is_published_by_another:
+            # Unless that transform was taken away since, or no longer follows.
+            others = (t for t in appended_transforms(self.container) if t is not self)
+            publishers = (t for t in others if isinstance(t, ConstraintPublisher))
+            self.is_published_by_another = any(t.publishes_for(self) for t in publishers)
         return self._call(tensordict_reset)
 
     def published(
@@ -473,6 +486,7 @@ def _is_missing_entry(error: BaseException) -> bool:
 class Check(NamedTuple):
     """What is to be checked of some states: the values that were read and the set they led to."""
 
+    name: str
     inputs: dict[NestedKey, Tensor]
     allowed: ConstraintSet
     refuse: Callable[[], None]
@@ -494,6 +508,23 @@ def evidence(checks: Sequence[Check]) -> list[Evidence]:
         for each in extremes(value, torch.finfo(value.dtype).max)
     ]
     return found + [each for check in checks for each in check.allowed.evidence()]
+
+
+def refuse_values(checks: Sequence[Check]) -> NoReturn:
+    """Refuse values whose `evidence` is beyond its limits.
+
+    Raises:
+        GeometryError: naming constraint, field and batch index; the constraints alone, where
+            looking at the values one by one finds nothing wrong with them.
+    """
+    for check in checks:
+        check.refuse()
+    raise GeometryError(
+        f"constraints {[check.name for check in checks]}: expected values within the limits of "
+        "their families' `evidence`, given some beyond that their `invalid_fields` accept; let the "
+        "two agree, and where steps are compiled, let `constraint_set` compute the same compiled "
+        "and not"
+    )
 
 
 def _refuse_other_shape(expected: str, given: Tensor, shape: Sequence[int]) -> None:

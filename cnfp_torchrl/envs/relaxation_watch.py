@@ -28,8 +28,8 @@ class RelaxationWatch:
     (`cnfp_torchrl.geometry.relaxation_floor`): an equality always does that much.
 
     Args:
-        names: names of the constraints, in order of application.
-        leeway: the leeway of their anchor.
+        names: Names of the constraints, in order of application.
+        leeway: The leeway of their anchor.
     """
 
     def __init__(self, names: Sequence[str], leeway: float) -> None:
@@ -51,9 +51,9 @@ class RelaxationWatch:
         """Look at a batch of states.
 
         Args:
-            sets: the action bounds and the constraints' sets.
-            relaxation: the amounts, ``(*batch, K + 1)``, the bounds' first.
-            states: number of states in the batch.
+            sets: The action bounds and the constraints' sets.
+            relaxation: The amounts, ``(*batch, K + 1)``, the bounds' first.
+            states: The number of states in the batch.
         """
         if not self._looks_left:
             return

@@ -10,7 +10,12 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from cnfp_torchrl.envs.geometry_transform import Check, GeometryTransform, evidence
+from cnfp_torchrl.envs.geometry_transform import (
+    Check,
+    GeometryTransform,
+    evidence,
+    refuse_values,
+)
 from cnfp_torchrl.geometry import (
     Anchored,
     Begun,
@@ -33,9 +38,9 @@ class Step(NamedTuple):
     """What is known of the anchors in some states before any search.
 
     Attributes:
-        begun: what a search goes on from; of a compiled pass without the sets.
-        is_decided: whether all states need no search.
-        is_published: whether it is published already that all constraints hold.
+        begun: What a search goes on from; of a compiled pass without the sets.
+        is_decided: Whether all states need no search.
+        is_published: Whether it is published already that all constraints hold.
     """
 
     begun: Begun
@@ -99,8 +104,7 @@ class StepGeometry:
             checks = []
         decided, *values = flags.tolist()
         if not are_within(values, limits):
-            for check in checks or self._checks(states):
-                check.refuse()
+            refuse_values(checks or self._checks(states))
         return Step(begun, bool(decided), self._compiled is not None)
 
     def sets(self, states: TensorDictBase) -> list[ConstraintSet]:

@@ -30,8 +30,8 @@ class Ball(ConstraintSet):
     r"""The ball :math:`\{a : |a - center| \le radius\}`.
 
     Args:
-        center: centers ``(*batch, d)``, finite.
-        radius: radii ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
+        center: Centers ``(*batch, d)``, finite.
+        radius: Radii ``(*batch,)``, finite, 0 or more; a ball of radius 0 is a point.
     """
 
     center: Tensor
@@ -63,6 +63,9 @@ class Ball(ConstraintSet):
     def bounding_box(self) -> Bounds:
         radius = self.radius.unsqueeze(-1)
         return Bounds(self.center - radius, self.center + radius)
+
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return torch.clamp(self.center, box.low, box.high)
 
     def inflated(self, by: Tensor) -> Self:
         return type(self)(self.center, self.radius + by.squeeze(-1), validate_args=False)
@@ -117,8 +120,8 @@ class Ellipsoid(ConstraintSet):
     r"""The ellipsoid :math:`\{m + T x : |x| \le 1\}` with T lower triangular.
 
     Args:
-        center: centers m, ``(*batch, d)``, finite.
-        scale_tril: matrices T, ``(*batch, d, d)``, zero above their positive diagonals.
+        center: Centers m, ``(*batch, d)``, finite.
+        scale_tril: Matrices T, ``(*batch, d, d)``, zero above their positive diagonals.
     """
 
     center: Tensor
@@ -237,9 +240,9 @@ class TaskSpaceBall(ConstraintSet):
     else none.
 
     Args:
-        jacobian: matrices J, ``(*batch, m, d)``, finite.
-        offset: vectors b, ``(*batch, m)``, finite.
-        radius: radii ``(*batch,)``, finite, 0 or more.
+        jacobian: Matrices J, ``(*batch, m, d)``, finite.
+        offset: Vectors b, ``(*batch, m)``, finite.
+        radius: Radii ``(*batch,)``, finite, 0 or more.
     """
 
     jacobian: Tensor
@@ -342,9 +345,9 @@ def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None)
     never does. Computed in units of the radius, whose square may be out of range.
 
     Args:
-        offset: points minus the ball's center, w, ``(*batch, d)``, shorter than the radius.
-        radius: radii r, ``(*batch,)``.
-        unit: length in which directions are given, ``(*batch,)``; None means 1.
+        offset: Points minus the ball's center, w, ``(*batch, d)``, shorter than the radius.
+        radius: Radii r, ``(*batch,)``.
+        unit: The length in which directions are given, ``(*batch,)``; None means 1.
     """
     offset = offset / radius.unsqueeze(-1)
     distance = vector_norm(offset, dim=-1)

@@ -21,9 +21,10 @@ from cnfp_torchrl.geometry.superlevel import Rows
 
 
 class _Kept(NamedTuple):
-    """What is known of a box: its magnitude, and for points of that size erosion and rounding."""
+    """What is known of a box: its size, and for points of that size erosion and rounding."""
 
     magnitude: Tensor
+    width: Tensor
     eroded: Any
     rounding: Tensor
 
@@ -37,8 +38,8 @@ class Box(ConstraintSet):
     r"""The box :math:`\{a : low \le a \le high\}`; infinite bounds are allowed.
 
     Args:
-        low: lower bounds ``(*batch, d)``.
-        high: upper bounds ``(*batch, d)``, none less than its lower bound.
+        low: Lower bounds ``(*batch, d)``.
+        high: Upper bounds ``(*batch, d)``, none less than its lower bound.
     """
 
     low: Tensor
@@ -81,6 +82,12 @@ class Box(ConstraintSet):
             return self._kept.magnitude
         return torch.maximum(self.high, -self.low).amax(-1)
 
+    def smallest_width(self) -> Tensor:
+        """Return the width in the narrowest component, ``(*batch,)``."""
+        if self._kept is not None:
+            return self._kept.width
+        return (self.high - self.low).amin(-1)
+
     def prepared(self) -> Self:
         """Return the box with what flows and anchors ask of action bounds computed once.
 
@@ -88,7 +95,8 @@ class Box(ConstraintSet):
         """
         box = type(self)(self.low.detach(), self.high.detach(), validate_args=False)
         magnitude = box.magnitude()
-        kept = _Kept(magnitude, box.eroded(magnitude), box.rounding(magnitude))
+        about = box.eroded(magnitude), box.rounding(magnitude)
+        kept = _Kept(magnitude, box.smallest_width(), *about)
         object.__setattr__(box, "_kept", kept)
         return box
 
@@ -98,6 +106,9 @@ class Box(ConstraintSet):
         eps, size = EROSION_IN_EPS * torch.finfo(self.dtype).eps, self._size(magnitude)
         low, high = torch.add(self.low, size, alpha=eps), torch.sub(self.high, size, alpha=eps)
         return type(self)(low, high, validate_args=False)
+
+    def row_count(self) -> int:
+        return 2 * self.dim
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
         if self._kept is not None and magnitude is self._kept.magnitude:
@@ -135,8 +146,8 @@ def require_action_bounds(bounds: Box, where: str = "action bounds") -> Box:
     Reads them on the host.
 
     Args:
-        bounds: box of all actions.
-        where: beginning of the message.
+        bounds: The box of all actions.
+        where: The beginning of the message.
 
     Raises:
         GeometryError: when a bound is not finite, or bounds are closer to each other than rounding
@@ -181,10 +192,10 @@ def gauge_of_sides(above: Tensor, below: Tensor, ahead: Tensor, behind: Tensor) 
     """Return the gauge of a box, ``(*batch,)``, at an offset from an anchor given by its `sides`.
 
     Args:
-        above: inverse distances from the anchor to the high bounds, ``(*batch, d)``.
-        below: inverse distances from the anchor to the low bounds, ``(*batch, d)``.
-        ahead: positive part of the offset, ``(*batch, d)``.
-        behind: negative part of the offset, ``(*batch, d)``.
+        above: Inverse distances from the anchor to the high bounds, ``(*batch, d)``.
+        below: Inverse distances from the anchor to the low bounds, ``(*batch, d)``.
+        ahead: The positive part of the offset, ``(*batch, d)``.
+        behind: The negative part of the offset, ``(*batch, d)``.
     """
     return torch.addcmul(ahead * above, behind, below).amax(-1)
 

@@ -45,8 +45,8 @@ class Bounds(NamedTuple):
     """Lower and upper bounds of the components of actions.
 
     Args:
-        low: lower bounds ``(*batch, d)``, minus infinity where none is known.
-        high: upper bounds ``(*batch, d)``, infinity where none is known.
+        low: Lower bounds ``(*batch, d)``, minus infinity where none is known.
+        high: Upper bounds ``(*batch, d)``, infinity where none is known.
     """
 
     low: Tensor
@@ -57,8 +57,8 @@ class Evidence(NamedTuple):
     """A number of a batch of states that tells on which side of a limit all of them are.
 
     Args:
-        value: number or flag, ``()``.
-        limit: largest absolute value that is good; NaN never is.
+        value: The number or flag, ``()``.
+        limit: The largest absolute value that is good; NaN never is.
     """
 
     value: Tensor
@@ -102,7 +102,8 @@ class ConstraintSet(ABC):
       dtypes and NaN,
     - `contains`, `bounding_box`: by default by `slack` and without bounds,
     - `superlevel`: a description of {slack >= t} that makes the search for anchors fast, and
-      `part_near` if the set is not convex.
+      `part_near` if the set is not convex,
+    - `deepest_within`: the deepest point within a box, which often spares that search.
 
     Constructing a set checks it, which reads tensors on the host. Hot paths construct sets with
     ``validate_args=False``: their values were checked where they entered.
@@ -137,8 +138,8 @@ class ConstraintSet(ABC):
         unbounded the gauge is 0.
 
         Args:
-            direction: vectors ``(*batch, d)``, none of them zero.
-            anchor: points strictly inside the set, ``(*batch, d)``; about others the result is
+            direction: Vectors ``(*batch, d)``, none of them zero.
+            anchor: Points strictly inside the set, ``(*batch, d)``; about others the result is
                 meaningless.
         """
 
@@ -150,7 +151,7 @@ class ConstraintSet(ABC):
         tolerance.
 
         Args:
-            magnitude: largest coordinate of the points, ``(*batch,)``.
+            magnitude: The largest coordinate of the points, ``(*batch,)``.
         """
 
     @abstractmethod
@@ -160,8 +161,8 @@ class ConstraintSet(ABC):
         It takes the place of a dropped set, with a ball that contains the action bounds.
 
         Args:
-            center: center of the ball, ``(*batch, d)``.
-            radius: radius of the ball, ``(*batch,)``, positive.
+            center: The center of the ball, ``(*batch, d)``.
+            radius: The radius of the ball, ``(*batch,)``, positive.
         """
 
     def inflated(self, by: Tensor) -> Self:
@@ -171,7 +172,7 @@ class ConstraintSet(ABC):
         cannot hold they are dropped.
 
         Args:
-            by: amounts in units of the slack, finite, 0 or more: ``(*batch, m)`` for the m rows of
+            by: Amounts in units of the slack, finite, 0 or more: ``(*batch, m)`` for the m rows of
                 `row_slacks`, or ``(*batch, 1)`` for all rows alike.
 
         Raises:
@@ -196,6 +197,13 @@ class ConstraintSet(ABC):
         """
         return self.slack(action).unsqueeze(-1)
 
+    def row_count(self) -> int:
+        """Return the number m of the rows of `row_slacks`."""
+        if not self.has_rows():
+            return 1
+        like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
+        return int(self.row_slacks(like.new_zeros(self.dim)).shape[-1])
+
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
         """Return how far `eroded` moves the boundary of each row inwards, ``(*batch, m)``."""
         like = next(value for name, value in self.fields().items() if self.event_dims[name] > 0)
@@ -208,7 +216,7 @@ class ConstraintSet(ABC):
         """Return the gauge about an anchor, with all that directions share computed once.
 
         Args:
-            anchor: points strictly inside the set, ``(*batch, d)``.
+            anchor: Points strictly inside the set, ``(*batch, d)``.
         """
         return partial(_gauge_at, self, anchor)
 
@@ -230,6 +238,20 @@ class ConstraintSet(ABC):
         high = torch.full((self.dim,), torch.inf, dtype=like.dtype, device=like.device)
         return Bounds(-high, high)
 
+    def deepest_within(self, box: Bounds) -> Tensor | None:
+        """Return the points of a box with the largest slack, where they have a closed form.
+
+        With them the cheapest attempts at an anchor decide most states. A box that is empty may
+        have any.
+
+        Args:
+            box: finite bounds ``(*batch, d)``.
+
+        Returns:
+            Points ``(*batch, d)``; None, the default, where there is no such form.
+        """
+        return None
+
     def superlevel(self) -> Superlevel | None:
         """Describe the actions with a slack of at least t, for the search for anchors.
 
@@ -245,7 +267,7 @@ class ConstraintSet(ABC):
         Only non-convex families override this: a convex set is its own and only part.
 
         Args:
-            point: points ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
         """
         return self.superlevel()
 
@@ -256,7 +278,7 @@ class ConstraintSet(ABC):
         set is convex.
 
         Args:
-            point: points ``(*batch, d)``.
+            point: Points ``(*batch, d)``.
 
         Returns:
             A description of batch shape ``(parts, *batch)``.
@@ -326,9 +348,9 @@ class ConstraintSet(ABC):
         """Return the set where it is active, and elsewhere one of its family that contains a ball.
 
         Args:
-            active: flags of the states in which the set stays, boolean ``(*batch,)``.
-            center: center of the ball, ``(*batch, d)``.
-            radius: radius of the ball, ``(*batch,)``.
+            active: Flags of the states in which the set stays, boolean ``(*batch,)``.
+            center: The center of the ball, ``(*batch, d)``.
+            radius: The radius of the ball, ``(*batch,)``.
         """
         return self.where(active, self.around(center, radius))
 
@@ -336,7 +358,7 @@ class ConstraintSet(ABC):
         """Return the set itself, or refuse it. Compiled and exported programs check shapes alone.
 
         Args:
-            name: name of the constraint, for the message.
+            name: The name of the constraint, for the message.
 
         Raises:
             GeometryError: naming constraint, field, batch index, the expected and the given.
@@ -375,7 +397,7 @@ class ConstraintSet(ABC):
         """Refuse fields of wrong types or shapes, without reading their values.
 
         Args:
-            where: beginning of the message.
+            where: The beginning of the message.
 
         Raises:
             GeometryError: naming the field, the expected and the given.

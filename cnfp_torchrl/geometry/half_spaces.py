@@ -32,8 +32,8 @@ class HalfSpaces(ConstraintSet):
     offset where the normal is zero.
 
     Args:
-        normals: outward normals of the rows, ``(*batch, m, d)``, finite.
-        offsets: offsets of the rows, ``(*batch, m)``; infinite ones let every action pass.
+        normals: Outward normals of the rows, ``(*batch, m, d)``, finite.
+        offsets: Offsets of the rows, ``(*batch, m)``; infinite ones let every action pass.
     """
 
     normals: Tensor
@@ -70,6 +70,9 @@ class HalfSpaces(ConstraintSet):
         """Return the distances to the rows' boundaries, ``(*batch, m)``."""
         rows = self.superlevel()
         return (rows.offsets - _rows(rows.normals, action)) / rows.rates
+
+    def row_count(self) -> int:
+        return self.normals.shape[-2]
 
     def inflated(self, by: Tensor) -> Self:
         rows = self.superlevel()

@@ -25,7 +25,7 @@ def length(vector: Tensor) -> Tensor:
     `torch.linalg.vector_norm` gives 0 for lengths below 1e-23 in float32, and infinity above 1e19.
 
     Args:
-        vector: vectors ``(*batch, d)``.
+        vector: Vectors ``(*batch, d)``.
     """
     if vector.dtype == torch.float32:
         # Squares of float32 are in range in float64, which takes fewer passes than a unit does.
@@ -40,7 +40,7 @@ def spectral_norm_bound(matrix: Tensor) -> Tensor:
     Exact where M is diagonal and where it has one row or one column.
 
     Args:
-        matrix: matrices M, ``(*batch, m, d)``.
+        matrix: Matrices M, ``(*batch, m, d)``.
     """
     if 0 in matrix.shape[-2:]:
         return matrix.new_zeros(matrix.shape[:-2])

@@ -204,7 +204,7 @@ def projector(constraint_set: ConstraintSet) -> Projector:
     family that describes itself has a projection.
 
     Args:
-        constraint_set: a set; of a non-convex one, what `superlevel` describes of it.
+        constraint_set: A set; of a non-convex one, what `superlevel` describes of it.
 
     Raises:
         TypeError: for a family that has neither.
@@ -230,8 +230,8 @@ def project(constraint_set: ConstraintSet, point: Tensor) -> Tensor:
     r"""Return the closest point of a set, :math:`\arg\min_{a \in C} |a - p|`.
 
     Args:
-        constraint_set: set of a family in `PROJECTIONS`, or with a `superlevel`.
-        point: points p, ``(*batch, d)``.
+        constraint_set: The set of a family in `PROJECTIONS`, or with a `superlevel`.
+        point: Points p, ``(*batch, d)``.
 
     Raises:
         TypeError: when the family has no projection.
@@ -257,10 +257,10 @@ def project_onto_intersection(region: Region, point: Tensor, rounds: int) -> Ten
     convex sets in Hilbert spaces".
 
     Args:
-        region: region of sets that have a `projector` or convex parts; its anchor is used for the
-            latter alone.
-        point: points ``(*batch, d)``.
-        rounds: number of rounds of Dykstra's algorithm, >= 1.
+        region: The region of sets that have a `projector` or convex parts; its anchor is used for
+            the latter alone.
+        point: Points ``(*batch, d)``.
+        rounds: The number of rounds of Dykstra's algorithm, >= 1.
 
     Raises:
         TypeError: for a set without projection.

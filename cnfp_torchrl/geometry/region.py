@@ -22,13 +22,13 @@ class Region:
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the box of action bounds and always
             holds, the last has the highest priority.
-        anchor: points strictly inside all sets that are not dropped, ``(*batch, d)``; None where
+        anchor: Points strictly inside all sets that are not dropped, ``(*batch, d)``; None where
             none is known, which all that takes gauges refuses.
-        active: flags of the sets that hold as stated, boolean ``(*batch, K + 1)``; None means all.
-        relaxation: amounts by which the m rows of each set are widened, ``(*batch, m)`` for each
+        active: Flags of the sets that hold as stated, boolean ``(*batch, K + 1)``; None means all.
+        relaxation: Amounts by which the m rows of each set are widened, ``(*batch, m)`` for each
             set, 0 where it is active, as `lexicographic_anchor` finds them. None means that all
             sets that are not active are dropped.
-        validate_args: whether to check shapes; no values are read.
+        validate_args: Whether to check shapes; no values are read.
 
     Raises:
         GeometryError: when the first set is not a box, or dimensions or the number of relaxations
@@ -283,7 +283,7 @@ def scaled_direction(offset: Tensor) -> tuple[Tensor, Tensor]:
     like 1/length, could overflow when squared.
 
     Args:
-        offset: points minus the anchor, ``(*batch, d)``.
+        offset: Points minus the anchor, ``(*batch, d)``.
 
     Returns:
         The direction ``(*batch, d)`` and the mask ``(*batch,)``.

@@ -16,9 +16,9 @@ class Rows:
     r"""Linear rows, :math:`n_j \cdot a + \rho_j t \le b_j`.
 
     Args:
-        normals: normals n, ``(*batch, m, d)``.
-        offsets: offsets b, ``(*batch, m)``; infinite ones are ignored.
-        rates: rates :math:`\rho \ge 0`, ``(*batch, m)``; with :math:`\rho_j = |n_j|` the slack is
+        normals: Normals n, ``(*batch, m, d)``.
+        offsets: Offsets b, ``(*batch, m)``; infinite ones are ignored.
+        rates: Rates :math:`\rho \ge 0`, ``(*batch, m)``; with :math:`\rho_j = |n_j|` the slack is
             the distance to the row's hyperplane.
     """
 
@@ -32,10 +32,10 @@ class Cone:
     r"""A second-order cone, :math:`|W a + y| \le h - \rho t`.
 
     Args:
-        matrix: matrices W, ``(*batch, k, d)``.
-        vector: vectors y, ``(*batch, k)``.
-        size: sizes h at a slack of 0, ``(*batch,)``.
-        rate: rates :math:`\rho > 0`, ``(*batch,)``.
+        matrix: Matrices W, ``(*batch, k, d)``.
+        vector: Vectors y, ``(*batch, k)``.
+        size: Sizes h at a slack of 0, ``(*batch,)``.
+        rate: Rates :math:`\rho > 0`, ``(*batch,)``.
     """
 
     matrix: Tensor
@@ -49,10 +49,10 @@ class KinkedSum:
     r"""A sum of kinked terms, :math:`\sum_i \max(\alpha_i a_i, \beta_i a_i) \le h - \rho t`.
 
     Args:
-        upper: slopes :math:`\alpha`, ``(*batch, d)``.
-        lower: slopes :math:`\beta`, ``(*batch, d)``.
-        size: sizes h at a slack of 0, ``(*batch,)``.
-        rate: rates :math:`\rho \ge 0`, ``(*batch,)``.
+        upper: Slopes :math:`\alpha`, ``(*batch, d)``.
+        lower: Slopes :math:`\beta`, ``(*batch, d)``.
+        size: Sizes h at a slack of 0, ``(*batch,)``.
+        rate: Rates :math:`\rho \ge 0`, ``(*batch,)``.
     """
 
     upper: Tensor

@@ -26,11 +26,11 @@ class VisibleRegion(ConstraintSet):
     pathwise gradient leaves out the jumps.
 
     Args:
-        position: positions p, ``(*batch, d)``, in units of length. A position in a rectangle makes
+        position: Positions p, ``(*batch, d)``, in units of length. A position in a rectangle makes
             the set empty.
-        rectangles: lowest and highest corners of m rectangles, ``(*batch, m, 2, d)``, in units of
+        rectangles: Lowest and highest corners of m rectangles, ``(*batch, m, 2, d)``, in units of
             length; infinite ones make walls, see `walls`.
-        step: lengths moved by an action of one, ``(*batch,)``, positive and finite.
+        step: Lengths moved by an action of one, ``(*batch,)``, positive and finite.
     """
 
     position: Tensor
@@ -45,8 +45,8 @@ class VisibleRegion(ConstraintSet):
         """Return 2d infinite rectangles, ``(*batch, 2d, 2, d)``, that enclose an arena.
 
         Args:
-            low: lowest corner of the arena, ``(*batch, d)``.
-            high: highest corner of the arena, ``(*batch, d)``.
+            low: The lowest corner of the arena, ``(*batch, d)``.
+            high: The highest corner of the arena, ``(*batch, d)``.
         """
         on_axis = torch.eye(low.shape[-1], dtype=torch.bool, device=low.device)
         below = torch.where(on_axis, low.unsqueeze(-2), torch.inf)
@@ -350,12 +350,12 @@ class VisibleOrBox(ConstraintSet):
     nothing; a box that leaves out 0 can.
 
     Args:
-        position: positions of the `VisibleRegion`, ``(*batch, d)``.
-        rectangles: corners of its rectangles, ``(*batch, m, 2, d)``.
-        step: lengths moved by an action of one, ``(*batch,)``.
-        low: lower bounds of the box, ``(*batch, d)``.
-        high: upper bounds of the box, ``(*batch, d)``.
-        in_sight: choice of the visible region (1) or the box (0), ``(*batch,)``.
+        position: Positions of the `VisibleRegion`, ``(*batch, d)``.
+        rectangles: Corners of its rectangles, ``(*batch, m, 2, d)``.
+        step: Lengths moved by an action of one, ``(*batch,)``.
+        low: Lower bounds of the box, ``(*batch, d)``.
+        high: Upper bounds of the box, ``(*batch, d)``.
+        in_sight: The choice of the visible region (1) or the box (0), ``(*batch,)``.
     """
 
     position: Tensor

@@ -28,8 +28,8 @@ class KinkedSumBound(ConstraintSet):
     A family derives :math:`\alpha_i \ge 0 \ge \beta_i` from its weights. The set contains 0.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     weights: Tensor
@@ -85,6 +85,9 @@ class KinkedSumBound(ConstraintSet):
         low, high = ((bound / s.abs()).masked_fill(s == 0, torch.inf) for s in (lower, upper))
         return Bounds(-low, high)
 
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return torch.zeros_like(box.low).clamp(box.low, box.high)
+
     def around(self, center: Tensor, radius: Tensor) -> Self:
         # The sum is at most |center|_1 at the center, and grows at most by one each unit.
         weights = torch.full_like(self.weights, self.dim**-0.5)
@@ -138,8 +141,8 @@ class WeightedL1Ball(KinkedSumBound):
     With joint velocities as weights and torques as actions it limits the power of all joints.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod
@@ -162,8 +165,8 @@ class PositivePart(KinkedSumBound):
     draw; power that they return does not count.
 
     Args:
-        weights: weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
-        bound: largest sums ``(*batch,)``, finite, 0 or more.
+        weights: Weights ``(*batch, d)``, finite; a weight of zero leaves its component free.
+        bound: Largest sums ``(*batch,)``, finite, 0 or more.
     """
 
     @staticmethod

@@ -24,6 +24,10 @@ class ConstraintPublisher(ABC):
     def bijectors(self) -> list[ConstraintBijector]:
         """The modules of the constraints that the transform publishes, one for each."""
 
+    def publishes_for(self, other: ConstraintPublisher) -> bool:
+        """Tell whether another transform can leave it to this one to publish its constraint."""
+        return False
+
 
 def constraint_bijectors(env: EnvBase) -> list[ConstraintBijector]:
     """Return a bijector for each constraint that an environment publishes.

@@ -18,7 +18,8 @@ Of slack and containment, and of what the search for anchors is told:
 - `check_superlevel`: it describes no more than the set, and all of a convex one,
 - `check_rows`, `check_inflated`: what is relaxed where the constraint cannot hold, and by how much,
 - `check_search_keeps_the_set`: what holds is not dropped,
-- `check_bounding_box`: it holds the set.
+- `check_bounding_box`: it holds the set,
+- `check_deepest_within`: no point of a box has more slack.
 
 Of gauges, about the given anchor and about others near the boundary, where arithmetic is worst:
 

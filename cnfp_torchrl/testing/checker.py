@@ -24,6 +24,7 @@ ABOUT_THE_GIVEN_ANCHOR = (
     slacks.check_superlevel,
     slacks.check_rows,
     slacks.check_inflated,
+    slacks.check_deepest_within,
     gauges.check_gauge_is_where_rays_leave,
 )
 ABOUT_ALL_ANCHORS = (
@@ -57,13 +58,14 @@ def check_constraint_set(
     """Check that a family of sets keeps the contract of `ConstraintSet`, by an example.
 
     Args:
-        sets: batch of different sets of the family, in float32 or float64, rounded to float32.
-        anchor: points well inside the sets, ``(*batch, d)``, best not their middles. A set that is
+        sets: The batch of different sets of the family, in float32 or float64, rounded to float32.
+        anchor: Points well inside the sets, ``(*batch, d)``, best not their middles. A set that is
             not convex must be star-shaped about its anchor.
-        bounds: finite action bounds that hold the anchors and are wider than the sets in some
+        bounds: The finite action bounds that hold the anchors and are wider than the sets in some
             directions; by default some times wider than the sets are where they are narrow.
-        samples: number of directions from each anchor: the given one and four near the boundary.
-        seed: seed of the checker's own random numbers; the global generator is left alone.
+        samples: The number of directions from each anchor: the given one and four near the
+            boundary.
+        seed: The seed of the checker's own random numbers; the global generator is left alone.
 
     Raises:
         FamilyError: naming family, method, batch element with its fields, direction or action, what

@@ -21,8 +21,8 @@ class Rays(NamedTuple):
     """Rays from an anchor to the action bounds.
 
     Args:
-        anchor: origins of the rays, ``(B, d)``.
-        directions: vectors from the anchor to about the bounds, ``(N, B, d)``.
+        anchor: Origins of the rays, ``(B, d)``.
+        directions: Vectors from the anchor to about the bounds, ``(N, B, d)``.
     """
 
     anchor: Tensor
@@ -42,10 +42,10 @@ class Example:
     """Sets and rays inside them, with a flat batch, in float64, of numbers that float32 holds too.
 
     Args:
-        sets: sets of the family, of batch shape ``(B,)``.
-        bounds: finite action bounds around the anchors, of batch shape ``(B,)``.
-        rays: rays from each anchor, those from the given one first.
-        random: generator of all random numbers.
+        sets: Sets of the family, of batch shape ``(B,)``.
+        bounds: The finite action bounds around the anchors, of batch shape ``(B,)``.
+        rays: Rays from each anchor, those from the given one first.
+        random: The generator of all random numbers.
     """
 
     sets: ConstraintSet

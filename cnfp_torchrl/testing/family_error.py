@@ -20,9 +20,9 @@ class FamilyError(AssertionError):
     """A family of sets that breaks the contract of `ConstraintSet`.
 
     Args:
-        family: class of the sets.
-        method: name of the method that is wrong, or ``"event_dims"``.
-        problem: sentence with the expected, the given, and where.
+        family: The class of the sets.
+        method: The name of the method that is wrong, or ``"event_dims"``.
+        problem: The sentence with the expected, the given, and where.
     """
 
     def __init__(self, family: type[ConstraintSet], method: str, problem: str) -> None:
@@ -42,13 +42,13 @@ def require(
     """Raise an error about the first case in which something does not hold.
 
     Args:
-        sets: sets of batch shape ``(B,)``.
-        method: name of the method that is wrong where something does not hold.
-        holds: flags, boolean ``(*sample, B)``.
-        expected: words for what should hold.
-        quantity: words for the values given.
-        given: values to show beside the expected, ``(*sample, B)``.
-        at: names and values of the points concerned, ``(*sample, B, d)`` or broadcasting to it.
+        sets: Sets of batch shape ``(B,)``.
+        method: The name of the method that is wrong where something does not hold.
+        holds: Flags, boolean ``(*sample, B)``.
+        expected: The wording of what should hold.
+        quantity: The wording of the values given.
+        given: Values to show beside the expected, ``(*sample, B)``.
+        at: Names and values of the points concerned, ``(*sample, B, d)`` or broadcasting to it.
 
     Raises:
         FamilyError: naming the batch element with its fields, and where it fails.

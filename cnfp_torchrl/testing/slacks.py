@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry import (
+    Bounds,
     Box,
     Cone,
     ConstraintSet,
@@ -203,6 +204,28 @@ def check_bounding_box(example: Example) -> None:
     holds = outside | (slack >= -1e-7 * example.size)
     expected = "every action of the set in the box"
     require(example.sets, "bounding_box", holds, expected, "a slack in it of", slack, action=action)
+
+
+def check_deepest_within(example: Example) -> None:
+    """The deepest point of a box lies in it, and no other has more slack."""
+    one, other = example.actions(_COUNT), example.actions(_COUNT).flip(0)
+    low, high = torch.minimum(one, other), torch.maximum(one, other)
+    method = "deepest_within"
+    deepest = called(
+        type(example.sets), method, lambda: example.sets.deepest_within(Bounds(low, high))
+    )
+    if deepest is None:
+        return
+    room = Box(low, high, validate_args=False).slack(deepest)
+    expected = "a point of the box"
+    require(example.sets, method, room >= 0, expected, "a slack in it of", room, action=deepest)
+    most = example.sets.slack(deepest)
+    for share in (0.0, 1.0, example.uniform(*low.shape), example.uniform(*low.shape).round()):
+        action = low + (high - low) * share
+        slack = example.sets.slack(action)
+        holds = slack <= most + _tolerance(example, slack)
+        expected = "no point of the box with more slack"
+        require(example.sets, method, holds, expected, "a slack of", slack, action=action)
 
 
 def check_contains_is_exact(example: Example) -> None:

@@ -56,15 +56,17 @@ def build_environment(
     """Return the environment of a configuration.
 
     Args:
-        config: configuration with the sections ``env`` and ``flow``.
-        batch_size: batch size of environments that have one; None takes that of the configuration.
-        device: device of the environment, and of the actor and the critics made for it; None leaves
-            it where it is.
-        with_anchor: publish anchor and active flags also where the flow does not need them.
-        with_penalty: subtract the penalty of ``env.penalty``, which is for training alone: policies
-            are judged on the reward without it.
-        compile: compute geometry and anchor of a step by a compiled function, where there is an
-            anchor (`constrain_env`).
+        config: The configuration with the sections ``env`` and ``flow``.
+        batch_size: The batch size of environments that have one; None takes that of the
+            configuration.
+        device: The device of the environment, and of the actor and the critics made for it; None
+            leaves it where it is.
+        with_anchor: Whether to publish anchor and active flags also where the flow does not need
+            them.
+        with_penalty: Whether to subtract the penalty of ``env.penalty``, which is for training
+            alone: policies are judged on the reward without it.
+        compile: Whether to compute geometry and anchor of a step by a compiled function, where
+            there is an anchor (`constrain_env`).
 
     Raises:
         ValueError: when a geometry is null or has another name than its key, and when there is none
@@ -286,9 +288,9 @@ def load_actor(
     """Return the trained actor of a run.
 
     Args:
-        folder: the run.
-        config: the run's configuration, from `RunFolder.load_config`.
-        env: an environment of that configuration.
+        folder: The run.
+        config: The run's configuration, from `RunFolder.load_config`.
+        env: An environment of that configuration.
 
     Raises:
         ValueError: when the run's checkpoint is not that of such an actor.

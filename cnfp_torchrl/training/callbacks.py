@@ -52,9 +52,10 @@ class CallbackFactory(Protocol):
     """Makes the callbacks of a run: what ``conf/visual/`` describes.
 
     Args:
-        episodes: number of episodes that callbacks get.
-        deterministic: take them from the deterministic policy and not from the stochastic one.
-        render_every: number of steps between two pictures of the environment; 0: none.
+        episodes: The number of episodes that callbacks get.
+        deterministic: Whether to take them from the deterministic policy and not from the
+            stochastic one.
+        render_every: The number of steps between two pictures of the environment; 0: none.
     """
 
     episodes: int
@@ -103,11 +104,11 @@ def show_episodes(
     """Give episodes of a run's policy to a callback, and return it, still open.
 
     Args:
-        folder: a finished run.
-        settings: those of `record_episode`.
-        factory: the maker of the callback.
-        recording: the file to record into.
-        trusted: see `RunFolder.load_config`.
+        folder: A finished run.
+        settings: Those of `record_episode`.
+        factory: The maker of the callback.
+        recording: The file to record into.
+        trusted: See `RunFolder.load_config`.
     """
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[1], with_anchor=True)

@@ -36,8 +36,8 @@ class Attributes:
     """The state of an object that has no ``state_dict``: some of its attributes.
 
     Args:
-        owner: the object.
-        names: the attributes' names; their values are numbers, text or tensors.
+        owner: The object.
+        names: The attributes' names; their values are numbers, text or tensors.
     """
 
     def __init__(self, owner: object, *names: str) -> None:
@@ -61,8 +61,8 @@ class Checkpoints:
     """The newest states of a run, each in a file that is whole or not there.
 
     Args:
-        path: the folder, made when it is first written to.
-        keep: number of states that are kept; the older ones serve when the newest is broken.
+        path: The folder, made when it is first written to.
+        keep: The number of states that are kept; the older ones serve when the newest is broken.
     """
 
     def __init__(self, path: Path, keep: int) -> None:
@@ -110,9 +110,9 @@ def restore(components: Mapping[str, Stateful], state: Mapping[str, Any], origin
     """Give each component its state.
 
     Args:
-        components: the objects, by name.
-        state: their states, by the same names.
-        origin: the folder that the states are from, for the message.
+        components: The objects, by name.
+        state: Their states, by the same names.
+        origin: The folder that the states are from, for the message.
 
     Raises:
         CheckpointError: naming the component whose state is missing or does not fit.
@@ -132,9 +132,9 @@ def save_data(path: Path, content: Any, run: Path) -> None:
     """Write tensors, numbers, text and containers of them, whole or not at all.
 
     Args:
-        path: the file.
-        content: what is written.
-        run: the run's folder, for the message.
+        path: The file.
+        content: What is written.
+        run: The run's folder, for the message.
 
     Raises:
         CheckpointError: when it cannot be written; what had the name before is still there.

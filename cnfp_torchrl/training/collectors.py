@@ -31,9 +31,9 @@ def make_collector(
     """Return the collector of a configuration.
 
     Args:
-        config: configuration of the run.
-        env: the environment of training, for a collector in this process.
-        policy: the policy of training.
+        config: The configuration of the run.
+        env: The environment of training, for a collector in this process.
+        policy: The policy of training.
     """
     make = instantiate(config.collector, _partial_=True)
     if not (isinstance(make.func, type) and issubclass(make.func, WorkerCollector)):
@@ -46,10 +46,10 @@ def _worker_environment(config: Any, worker: int, frames: int) -> TransformedEnv
     """Return a worker's environment, with random numbers of its own.
 
     Args:
-        config: configuration of the run, as plain data.
-        worker: number of the worker.
-        frames: number of frames so far, after which a resumed run draws other numbers than at its
-            beginning.
+        config: The configuration of the run, as plain data.
+        worker: The number of the worker.
+        frames: The number of frames so far, after which a resumed run draws other numbers than at
+            its beginning.
     """
     composed = OmegaConf.create(config)
     seed = composed.seed + worker + frames
@@ -76,7 +76,7 @@ class WorkerPolicy(TensorDictModuleBase):
     taken. Whether to act at random is a buffer, which travels with the weights.
 
     Args:
-        policy: the policy of training.
+        policy: The policy of training.
     """
 
     acts_at_random: Tensor
@@ -103,11 +103,11 @@ class WorkerCollector(ABC):
     episodes.
 
     Args:
-        make_env: what makes the environment of a worker, given its number and the frames so far.
-        policy: the policy of training.
-        workers: number of workers.
-        frames_per_batch: number of frames that a worker collects at a time.
-        total_frames: number of frames to collect in all.
+        make_env: What makes the environment of a worker, given its number and the frames so far.
+        policy: The policy of training.
+        workers: The number of workers.
+        frames_per_batch: The number of frames that a worker collects at a time.
+        total_frames: The number of frames to collect in all.
 
     Raises:
         ValueError: for fewer than one worker.
@@ -254,11 +254,11 @@ class Ray(WorkerCollector):
     Where none is running, one is started on this machine, and stopped at the end.
 
     Args:
-        make_env: see `WorkerCollector`.
-        policy: the policy of training.
-        memory: bytes that a worker asks Ray for.
-        options: further arguments of `ray.init`, such as the address of a cluster.
-        kwargs: arguments of `WorkerCollector`.
+        make_env: See `WorkerCollector`.
+        policy: The policy of training.
+        memory: Bytes that a worker asks Ray for.
+        options: Further arguments of `ray.init`, such as the address of a cluster.
+        kwargs: Arguments of `WorkerCollector`.
 
     Raises:
         ModuleNotFoundError: without the package of the extra ``ray``.

@@ -36,12 +36,12 @@ class ConstraintCounts:
     """Counts of one constraint over a number of steps; two of them can be added.
 
     Args:
-        violations: number of violating steps; None where nothing judges the constraint.
-        steps: number of steps by what the constraint was in their states
+        violations: The number of violating steps; None where nothing judges the constraint.
+        steps: The number of steps by what the constraint was in their states
             (`cnfp_torchrl.keys.CONSTRAINT_STATES`); empty where the environment does not tell.
-        violations_while: number of violating steps by the same; empty where either is unknown.
-        largest_relaxation: largest amount by which it was relaxed, in units of its slack.
-        total_relaxation: sum of the amounts over the steps in which it was relaxed.
+        violations_while: The number of violating steps by the same; empty where either is unknown.
+        largest_relaxation: The largest amount by which it was relaxed, in units of its slack.
+        total_relaxation: The sum of the amounts over the steps in which it was relaxed.
     """
 
     violations: int | None = None

@@ -24,8 +24,8 @@ class CollectorState:
     resumed; the steps of the broken ones are in the replay buffer, their returns are not counted.
 
     Args:
-        collector: the collector, which has been made and not iterated over.
-        env: the collector's environment.
+        collector: The collector, which has been made and not iterated over.
+        env: The collector's environment.
     """
 
     def __init__(self, collector: BaseCollector, env: EnvBase) -> None:

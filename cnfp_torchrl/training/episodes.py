@@ -33,14 +33,14 @@ def record_episode(
     An episode has a seed of its own, so that none depends on how many others are run.
 
     Args:
-        env: the environment with anchor and active flags; a batch of one takes the least time, of
+        env: The environment with anchor and active flags; a batch of one takes the least time, of
             more the first agent is recorded.
-        actor: the actor.
-        settings: seed of the first episode, and the length at which episodes are cut off.
-        number: number of the episode, from 0.
-        deterministic: take `deterministic_sample` instead of drawing.
-        render_every: of every n-th state, a picture is kept at ``pixels``, as far as the
-            environment renders itself; 0: of none.
+        actor: The actor.
+        settings: The seed of the first episode, and the length at which episodes are cut off.
+        number: The number of the episode, from 0.
+        deterministic: Whether to take `deterministic_sample` instead of drawing.
+        render_every: The interval n in states: of every n-th, a picture is kept at ``pixels``, as
+            far as the environment renders itself; 0: of none.
     """
     env.set_seed(settings.seed + number)
     torch.manual_seed(settings.seed + number)

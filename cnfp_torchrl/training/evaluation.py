@@ -45,8 +45,8 @@ class LinearScore:
     """A return placed on a line through two references, so that results compare.
 
     Args:
-        zero: the return that scores 0.
-        one: the return that scores 1.
+        zero: The return that scores 0.
+        one: The return that scores 1.
 
     Raises:
         ValueError: for a reference that is no number, and for two equal ones.
@@ -72,7 +72,7 @@ class StandStill(TensorDictModuleBase):
     """Always the zero action.
 
     Args:
-        head: the flow module of an actor, which knows the action's key and size.
+        head: The flow module of an actor, which knows the action's key and size.
     """
 
     def __init__(self, head: ConstrainedFlowModule) -> None:
@@ -93,12 +93,12 @@ class Evaluation:
     """What happened in a number of whole episodes.
 
     Args:
-        returns: undiscounted return of each episode, ``(episodes,)``.
-        costs: violations of each episode by judge, ``(episodes, J)``.
-        constraints: counts of each constraint: those that are judged first, in the order of the
+        returns: The undiscounted return of each episode, ``(episodes,)``.
+        costs: Violations of each episode by judge, ``(episodes, J)``.
+        constraints: Counts of each constraint: those that are judged first, in the order of the
             costs.
-        steps: number of steps of these episodes in all.
-        cut_off: number of episodes that would have gone on and were cut off.
+        steps: The number of steps of these episodes in all.
+        cut_off: The number of episodes that would have gone on and were cut off.
     """
 
     returns: Tensor
@@ -139,10 +139,10 @@ def evaluate_seeded(
     """Run the episodes that a seed determines: starts, goals and what the policy draws.
 
     Args:
-        env: see `evaluate`.
-        policy: see `evaluate`.
-        settings: number of episodes, the seed, and the length at which episodes are cut off.
-        deterministic: see `evaluate`.
+        env: See `evaluate`.
+        policy: See `evaluate`.
+        settings: The number of episodes, the seed, and the length at which episodes are cut off.
+        deterministic: See `evaluate`.
     """
     env.set_seed(settings.seed)
     torch.manual_seed(settings.seed)
@@ -167,12 +167,13 @@ def evaluate(
     """Run a policy for whole episodes and count.
 
     Args:
-        env: environment of any batch size; as many batches are run as the episodes need, of which
-            the first episodes count.
-        policy: any TorchRL policy.
-        episodes: number of episodes.
-        deterministic: take `deterministic_sample` of a probabilistic policy instead of drawing.
-        max_steps: length at which an episode that goes on is cut off, which a warning tells.
+        env: The environment of any batch size; as many batches are run as the episodes need, of
+            which the first episodes count.
+        policy: Any TorchRL policy.
+        episodes: The number of episodes.
+        deterministic: Whether to take `deterministic_sample` of a probabilistic policy instead of
+            drawing.
+        max_steps: The length at which an episode that goes on is cut off, which a warning tells.
 
     Raises:
         ValueError: when `episodes` is not positive.
@@ -255,9 +256,9 @@ def evaluate_run(
     """Return the report of the trained policy and of each baseline.
 
     Args:
-        folder: a finished run.
-        settings: number of episodes and the seed, the same for all.
-        trusted: see `RunFolder.load_config`.
+        folder: A finished run.
+        settings: The number of episodes and the seed, the same for all.
+        trusted: See `RunFolder.load_config`.
     """
     config = folder.load_config(trusted)
     env = build_environment(config, batch_size=[settings.episodes], with_anchor=True)

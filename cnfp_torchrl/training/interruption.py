@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -40,8 +40,8 @@ class TrainingInterrupted(BaseException):
     No `Exception`, which Hydra would take for a failure and go on with the next run of a sweep.
 
     Args:
-        number: number of the signal.
-        message: sentence that says how to go on.
+        number: The number of the signal.
+        message: The sentence that says how to go on.
     """
 
     def __init__(self, number: int, message: str) -> None:
@@ -61,7 +61,7 @@ class StopRequest:
     Outside of the main thread, where Python takes no signals, nothing is changed.
 
     Args:
-        signals: numbers of the signals; none changes nothing.
+        signals: Numbers of the signals; none changes nothing.
     """
 
     def __init__(self, signals: Sequence[int] = STOP_SIGNALS) -> None:
@@ -77,12 +77,7 @@ class StopRequest:
             self._previous = {n: signal.signal(n, self._remember) for n in self._signals}
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
@@ -91,7 +86,7 @@ class StopRequest:
         """End by a signal at once, for work that begins anew when the run goes on.
 
         Args:
-            message: sentence that says how to go on.
+            message: The sentence that says how to go on.
 
         Raises:
             TrainingInterrupted: when a signal comes, or has come before.

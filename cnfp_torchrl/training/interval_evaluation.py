@@ -21,10 +21,10 @@ class IntervalEvaluation:
     without it.
 
     Args:
-        make_env: maker of the environment, without a penalty; called at the first evaluation.
-        actor: the actor that is trained.
-        settings: the interval, the number of episodes and the seed.
-        score: the scale of returns, if the task has one.
+        make_env: The maker of the environment, without a penalty; called at the first evaluation.
+        actor: The actor that is trained.
+        settings: The interval, the number of episodes and the seed.
+        score: The scale of returns, if the task has one.
     """
 
     def __init__(
@@ -45,8 +45,8 @@ class IntervalEvaluation:
         """Return the report of an evaluation after this many steps, or None where none is due.
 
         Args:
-            frames: number of environment steps so far.
-            is_last: whether training ends here, after which the policy is the last candidate for
+            frames: The number of environment steps so far.
+            is_last: Whether training ends here, after which the policy is the last candidate for
                 the best one.
 
         Raises:

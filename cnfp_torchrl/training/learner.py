@@ -34,8 +34,8 @@ class Learner(Protocol):
         """Make the updates that are due, and yield the losses of each.
 
         Args:
-            collected: transitions ``(*environments, time)``.
-            frames: number of environment steps so far, with these.
+            collected: Transitions ``(*environments, time)``.
+            frames: The number of environment steps so far, with these.
         """
         ...
 

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
-from cnfp_torchrl.whole_file import whole_file
+from cnfp_torchrl.whole_file import remove_partial_files, whole_file
 
 EVALUATION = "evaluation/"
 """The beginning of the names of what evaluations during training log."""
@@ -18,9 +18,9 @@ def cut_logs(folder: Path, step: int, evaluated_at: int) -> None:
     What is removed will be written anew, so that no row is missing and none is there twice.
 
     Args:
-        folder: a run's folder, in whose subfolders the loggers write.
-        step: the last one whose entries stay.
-        evaluated_at: the last one of which an evaluation stays: that of a run's end comes behind
+        folder: A run's folder, in whose subfolders the loggers write.
+        step: The last one whose entries stay.
+        evaluated_at: The last one of which an evaluation stays: that of a run's end comes behind
             the state of the same step.
     """
 
@@ -28,6 +28,7 @@ def cut_logs(folder: Path, step: int, evaluated_at: int) -> None:
         return evaluated_at if name.startswith(EVALUATION) else step
 
     for path in sorted(folder.glob("*/scalars/**/*.csv")):
+        remove_partial_files(path)
         last = last_step(path.as_posix().rpartition("/scalars/")[2])
         lines = path.read_bytes().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith(b"\n") and int(line.split(b",")[0]) <= last]
@@ -35,6 +36,7 @@ def cut_logs(folder: Path, step: int, evaluated_at: int) -> None:
             with whole_file(path) as file:
                 file.writelines(kept)
     for path in sorted(folder.rglob("events.out.tfevents.*")):
+        remove_partial_files(path)  # which TensorBoard would read, too
         _cut_events(path, last_step)
 
 

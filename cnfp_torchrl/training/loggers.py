@@ -19,9 +19,9 @@ def weights_and_biases(
     """Return TorchRL's logger for Weights & Biases, for a run that may be gone on with.
 
     Args:
-        log_dir: the run's folder, after which the run is called.
-        project: the project at Weights & Biases.
-        offline: write into the folder alone, for ``wandb sync``.
+        log_dir: The run's folder, after which the run is called.
+        project: The project at Weights & Biases.
+        offline: Whether to write into the folder alone, for ``wandb sync``.
 
     Raises:
         ImportError: when ``wandb`` is not installed.

@@ -30,9 +30,9 @@ class Metrics:
 
     Args:
         loggers: TorchRL loggers; each scalar goes to all of them.
-        tally: tally of the environment's constraints, which has counted nothing yet.
-        total_frames: the length of the run, in environment steps.
-        interval: environment steps between two entries of the log.
+        tally: The tally of the environment's constraints, which has counted nothing yet.
+        total_frames: The length of the run, in environment steps.
+        interval: The environment steps between two entries of the log.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Metrics:
         """Write an evaluation into the log, together with an entry of training.
 
         Args:
-            report: its ``return_mean``, ``score`` and ``violations``.
+            report: Its ``return_mean``, ``score`` and ``violations``.
         """
         self.finish()  # so that what is logged up to here is what a resumed run keeps
         self._log(f"{EVALUATION}return", report["return_mean"])

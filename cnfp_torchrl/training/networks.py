@@ -21,11 +21,11 @@ def gaussian_network(
     """Return a network from observations to location and scale of a Gaussian over latents.
 
     Args:
-        observation_size: number of observed numbers.
-        action_size: number d of action components.
-        hidden: widths of the hidden layers.
-        scale_mapping: map to a positive scale, see `torchrl.modules.NormalParamExtractor`.
-        scale_lb: lower bound of the scale.
+        observation_size: The number of observed numbers.
+        action_size: The number d of action components.
+        hidden: Widths of the hidden layers.
+        scale_mapping: The map to a positive scale, see `torchrl.modules.NormalParamExtractor`.
+        scale_lb: The lower bound of the scale.
     """
     return nn.Sequential(
         MLP(
@@ -45,8 +45,8 @@ class LatentLocation(nn.Module):
     would run away from where it has gradients.
 
     Args:
-        noise: the scale, that of exploration, in units of the latent.
-        reach: the largest absolute value of a location.
+        noise: The scale, that of exploration, in units of the latent.
+        reach: The largest absolute value of a location.
     """
 
     def __init__(self, noise: float, reach: float) -> None:
@@ -69,11 +69,11 @@ def deterministic_network(
     """Return a network from observations to a latent, with a fixed scale of exploration.
 
     Args:
-        observation_size: number of observed numbers.
-        action_size: number d of action components.
-        hidden: widths of the hidden layers.
-        noise: scale of exploration, in units of the latent.
-        reach: largest absolute value of a latent without noise.
+        observation_size: The number of observed numbers.
+        action_size: The number d of action components.
+        hidden: Widths of the hidden layers.
+        noise: The scale of exploration, in units of the latent.
+        reach: The largest absolute value of a latent without noise.
     """
     network = MLP(
         in_features=observation_size,
@@ -120,10 +120,10 @@ def action_cost_network(
     """Return a critic of ``observation`` and ``action`` that writes ``state_action_cost`` > 0.
 
     Args:
-        observation_size: number of observed numbers.
-        action_size: number d of action components.
-        constraints: number K of outputs.
-        hidden: widths of the hidden layers.
+        observation_size: The number of observed numbers.
+        action_size: The number d of action components.
+        constraints: The number K of outputs.
+        hidden: Widths of the hidden layers.
     """
     network = MLP(
         in_features=observation_size + action_size,

@@ -26,11 +26,11 @@ class OffPolicyLearner:
     """Stores all transitions, acts at random first, and learns from random batches.
 
     Args:
-        config: configuration of the run.
-        env: the environment of training.
-        actor: the actor to train.
-        states: folder of the transitions that a resumed run needs; None keeps none.
-        actor_every: number of updates of the critics for one of the actor and the targets.
+        config: The configuration of the run.
+        env: The environment of training.
+        actor: The actor to train.
+        states: The folder of the transitions that a resumed run needs; None keeps none.
+        actor_every: The number of updates of the critics for one of the actor and the targets.
 
     Raises:
         ValueError: for a loss of another kind of algorithm.

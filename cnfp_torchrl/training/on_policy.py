@@ -22,13 +22,13 @@ class OnPolicyLearner:
     """Learns from each batch of transitions several times, in random parts.
 
     Args:
-        config: configuration of the run.
-        env: the environment of training.
-        actor: the actor to train.
-        states: folder of what a resumed run needs, of which there is nothing.
-        epochs: number of times that each transition is learned from.
-        minibatch: number of transitions of an update.
-        max_grad_norm: largest norm of an update's gradient; longer ones are shortened to it.
+        config: The configuration of the run.
+        env: The environment of training.
+        actor: The actor to train.
+        states: The folder of what a resumed run needs, of which there is nothing.
+        epochs: The number of times that each transition is learned from.
+        minibatch: The number of transitions of an update.
+        max_grad_norm: The largest norm of an update's gradient; longer ones are shortened to it.
 
     Raises:
         ValueError: for a loss that reads no advantages.

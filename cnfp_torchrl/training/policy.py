@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -16,7 +17,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import GeometryTransform, appended_transforms
+from cnfp_torchrl.envs import (
+    GeometryTransform,
+    ObservedEntry,
+    appended_transforms,
+    observed_entries,
+    refuse_changed_inputs,
+)
 from cnfp_torchrl.keys import CONSTRAINTS_KEY
 from cnfp_torchrl.modules import ConstraintPublisher, flow_head, guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
@@ -58,10 +65,12 @@ class TrainedPolicy:
             transform for transform in self._publishers if isinstance(transform, GeometryTransform)
         ]
         keys = [*(key for transform in read for key in transform.in_keys), *actor.in_keys]
-        self.in_keys: list[NestedKey] = list(dict.fromkeys(filter(_is_observed, keys)))
-        """The keys of what has to be observed: by networks, and by the constraints' geometry."""
-        spec = env.observation_spec
-        self._specs = {key: spec[key] for key in self.in_keys}
+        self._entries = observed_entries(env, filter(_is_observed, keys))
+        leaves = (leaf.key for entry in self._entries for leaf in entry.leaves())
+        self.in_keys: list[NestedKey] = list(dict.fromkeys(leaves))
+        """The keys of what has to be observed: of a vector that `CatTensors` makes, its parts."""
+        if self._publishers:
+            refuse_changed_inputs(env, self.in_keys)
 
     def __call__(self, observation: Values | Mapping[NestedKey, Values]) -> Values:
         """Return an allowed action ``(*batch, d)`` for each observation.
@@ -79,47 +88,49 @@ class TrainedPolicy:
                 returns NaN would cause; then nothing is returned that could be executed.
         """
         given = observation if isinstance(observation, Mapping) else {self._only_key(): observation}
-        entries = {key: self._entry(key, _found(given, key)) for key in self.in_keys}
-        first = self.in_keys[0]
-        batch = entries[first].shape[: entries[first].ndim - self._event_ndim(first)]
-        state = TensorDict(entries, batch_size=batch)
+        values = {each.key: each.value(partial(self._value, given)) for each in self._entries}
+        first = self._entries[0]
+        batch = values[first.key].shape[: values[first.key].ndim - first.spec.ndim]
+        state = TensorDict(values, batch_size=batch)
         with torch.no_grad(), set_exploration_type(self._mode):
             for publisher in self._publishers:
                 state = publisher(state)
             action = self._policy(state).get(self.env.action_key)
-        is_numpy = isinstance(_found(given, first), np.ndarray)
+        keys = [*self.in_keys, *(each.key for each in self._entries)]
+        is_numpy = any(isinstance(_found(given, key), np.ndarray) for key in keys)
         return cast(Values, action.numpy() if is_numpy else action)
 
     def _only_key(self) -> NestedKey:
-        if len(self.in_keys) > 1:
+        if len(self._entries) > 1:
             raise ValueError(
                 f"observation: expected a mapping with the entries {self.in_keys}, which networks "
                 "and constraints read, given one array"
             )
-        return self.in_keys[0]
+        return self._entries[0].key
 
-    def _entry(self, key: NestedKey, value: Values | None) -> Tensor:
-        spec = self._specs[key]
-        event = tuple(spec.shape[len(self.env.batch_size) :])
+    def _value(self, given: Mapping[Any, Any], entry: ObservedEntry) -> Tensor | None:
+        """Return an entry as it is given, None where its parts are to make it."""
+        key, value, event = entry.key, _found(given, entry.key), tuple(entry.spec.shape)
         if value is None:
+            if entry.parts:
+                return None
             raise ValueError(
                 f"observation: expected the entries {self.in_keys}, {key!r} is missing"
             )
         try:
-            tensor = torch.as_tensor(value).to(spec.dtype)
+            tensor = torch.as_tensor(value).to(entry.spec.dtype)
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(
                 f"observation, {key!r}: expected an array or a tensor of numbers, given {value!r}"
             ) from None
-        if tuple(tensor.shape[max(tensor.ndim - len(event), 0) :]) != event:
-            raise ValueError(
-                f"observation, {key!r}: expected shape (*batch, {', '.join(map(str, event))}), as "
-                f"the environment has it, given {tuple(tensor.shape)}"
-            )
-        return tensor
-
-    def _event_ndim(self, key: NestedKey) -> int:
-        return self._specs[key].ndim - len(self.env.batch_size)
+        if tuple(tensor.shape[max(tensor.ndim - len(event), 0) :]) == event:
+            return tensor
+        if entry.parts:  # the first of which may have the same key
+            return None
+        raise ValueError(
+            f"observation, {key!r}: expected shape (*batch, {', '.join(map(str, event))}), as "
+            f"the environment has it, given {tuple(tensor.shape)}"
+        )
 
 
 def _found(observation: Mapping[Any, Any], key: NestedKey) -> Any:

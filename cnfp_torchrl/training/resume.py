@@ -22,10 +22,10 @@ def resumed_config(
     """Return the configuration of a run, with the overrides that do not change what it is.
 
     Args:
-        folder: the run's folder.
-        composed: the configuration that these overrides give with the defaults.
-        overrides: those of the command line, as Hydra takes them.
-        trusted: see `RunFolder.load_training_config`.
+        folder: The run's folder.
+        composed: The configuration that these overrides give with the defaults.
+        overrides: Those of the command line, as Hydra takes them.
+        trusted: See `RunFolder.load_training_config`.
 
     Raises:
         ValueError: naming the key that would change what is gone on with, or fewer steps.

@@ -20,7 +20,7 @@ from torch import nn
 
 from cnfp_torchrl.configuration.trust import BUILT, read_plain, require_trusted, targets
 from cnfp_torchrl.training.checkpoints import CheckpointError, save_data
-from cnfp_torchrl.whole_file import whole_file, write_json
+from cnfp_torchrl.whole_file import remove_partial_files, whole_file, write_json
 
 CONFIG, CHECKPOINT, SUMMARY = "config.yaml", "checkpoint.pt", "summary.json"
 FAILURE = "failure.json"
@@ -36,8 +36,8 @@ class RunFolder:
     """The folder of one training run: configuration, checkpoint, summary, metrics and figures.
 
     Args:
-        path: the folder.
-        checkpoint: name of the file that policies are read from.
+        path: The folder.
+        checkpoint: The name of the file that policies are read from.
     """
 
     def __init__(self, path: str | Path, checkpoint: str = CHECKPOINT) -> None:
@@ -136,8 +136,8 @@ class RunFolder:
         """Return the folder of a finished run.
 
         Args:
-            path: the folder.
-            checkpoint: name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
+            path: The folder.
+            checkpoint: The name of the file with the policy: `CHECKPOINT`, the last one, or `BEST`.
 
         Raises:
             FileNotFoundError: when it holds no configuration or checkpoint, naming what is missing.
@@ -191,7 +191,7 @@ class RunFolder:
         Sections of training alone, such as the optimizer's, are left out; `load_settings` has them.
 
         Args:
-            trusted: packages, modules or objects that may be named beside what the shipped
+            trusted: Packages, modules or objects that may be named beside what the shipped
                 configuration names, such as ``my_package.envs.``.
 
         Raises:
@@ -211,7 +211,7 @@ class RunFolder:
         """Read what the run can be trained further from: all of its configuration.
 
         Args:
-            trusted: see `load_config`.
+            trusted: See `load_config`.
 
         Raises:
             ValueError: as `load_config`.
@@ -334,6 +334,11 @@ class RunFolder:
     def how_to_resume(self, frames: int) -> str:
         """Return a sentence for whoever stopped the run."""
         return f"stopped and saved at step {frames}; go on with: {self._resuming()}"
+
+    def remove_partial_files(self) -> None:
+        """Remove what is left of files that a run was writing when it was killed."""
+        for name in (CONFIG, CHECKPOINT, BEST, SUMMARY, FAILURE, f"{STATES}/*"):
+            remove_partial_files(self.path / name)
 
     def save_failure(self, error: BaseException) -> None:
         """Write why the run failed, as far as that can be written."""

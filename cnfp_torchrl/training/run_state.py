@@ -26,8 +26,8 @@ class RunState:
     """The state of a run, in files that grow with the run by what is new.
 
     Args:
-        folder: the run's folder.
-        settings: how often states are saved.
+        folder: The run's folder.
+        settings: The settings of how often states are saved.
     """
 
     def __init__(self, folder: RunFolder, settings: CheckpointSettings) -> None:
@@ -63,8 +63,9 @@ class RunState:
     def drop_what_came_after(self) -> None:
         """Remove the states and the entries of logs after the state that was loaded.
 
-        To be called before the loggers are made.
+        So are files that were half written. To be called before the loggers are made.
         """
+        self._folder.remove_partial_files()
         self._checkpoints.drop_after(self._saved_at)
         logged_at = evaluated_at = 0
         if self._saved is not None:
@@ -80,9 +81,9 @@ class RunState:
         """Give the components of the run the state that was loaded, if any, and keep track of them.
 
         Args:
-            components: everything that has a state, by name. The order counts: what draws random
+            components: Everything that has a state, by name. The order counts: what draws random
                 numbers while it takes its state comes before what holds the random state.
-            transitions: the replay buffer, if what it holds is needed from one step to the next.
+            transitions: The replay buffer, if what it holds is needed from one step to the next.
 
         Raises:
             CheckpointError: when the state is of other components.
@@ -125,8 +126,8 @@ class BestPolicy:
     """Keeps the policy that scored best without a violation.
 
     Args:
-        folder: the run's folder, in which it is kept as `BEST`.
-        modules: what is kept of it, by name, as in the last policy's checkpoint.
+        folder: The run's folder, in which it is kept as `BEST`.
+        modules: What is kept of it, by name, as in the last policy's checkpoint.
     """
 
     def __init__(self, folder: RunFolder, **modules: nn.Module | Optimizer) -> None:
@@ -138,8 +139,8 @@ class BestPolicy:
         """Keep the policy if it is better than the best so far.
 
         Args:
-            score: its score, or its return where a task has no score; NaN where none is known.
-            violations: all violations so far; those since the last offer count.
+            score: Its score, or its return where a task has no score; NaN where none is known.
+            violations: All violations so far; those since the last offer count.
         """
         is_clean, self.violations = violations == self.violations, violations
         if is_clean:
@@ -149,7 +150,7 @@ class BestPolicy:
         """Keep the policy if an evaluation during training says that it is better, and clean.
 
         Args:
-            report: the evaluation's ``return_mean``, ``score`` and ``violations``.
+            report: The evaluation's ``return_mean``, ``score`` and ``violations``.
         """
         if not any(report["violations"].values()):
             score = report["return_mean"] if report["score"] is None else report["score"]

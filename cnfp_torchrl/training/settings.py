@@ -14,11 +14,12 @@ class TrainingSettings:
     """Numbers of warm-up steps, updates and log entries.
 
     Args:
-        warmup_frames: environment steps with safe random actions, before the actor acts and learns.
-        update_ratio: updates for each environment step.
-        log_interval: environment steps between two entries of the log.
-        constraint_bytes: memory that a stored transition may take for constraints; sets that do not
-            fit are computed anew at sampling, which takes a little time.
+        warmup_frames: The environment steps with safe random actions, before the actor acts and
+            learns.
+        update_ratio: Updates for each environment step.
+        log_interval: The environment steps between two entries of the log.
+        constraint_bytes: The memory that a stored transition may take for constraints; sets that do
+            not fit are computed anew at sampling, which takes a little time.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -38,9 +39,9 @@ class CheckpointSettings:
     """How often the state of a run is saved, so that it can go on after it was stopped.
 
     Args:
-        interval: environment steps between two states; None saves none, not even when stopped.
-        keep: number of newest states that are kept.
-        keep_last: whether a finished run keeps its last state, so that it can be extended.
+        interval: The environment steps between two states; None saves none, not even when stopped.
+        keep: The number of newest states that are kept.
+        keep_last: Whether a finished run keeps its last state, so that it can be extended.
 
     Raises:
         ValueError: naming the setting, what was expected and what was given.
@@ -59,11 +60,12 @@ class EvaluationSettings:
     """Number and seed of the episodes that policies are judged by.
 
     Args:
-        episodes: number of whole episodes for each policy, after training.
-        seed: seed of the environment and of what policies draw, the same for all of them.
-        max_steps: length at which an episode is cut off, for environments that never end one.
-        interval: environment steps of training between two evaluations; None evaluates only after.
-        interval_episodes: number of whole episodes of each evaluation during training, at most
+        episodes: The number of whole episodes for each policy, after training.
+        seed: The seed of the environment and of what policies draw, the same for all of them.
+        max_steps: The length at which an episode is cut off, for environments that never end one.
+        interval: The environment steps of training between two evaluations; None evaluates only
+            after.
+        interval_episodes: The number of whole episodes of each evaluation during training, at most
             `episodes`.
 
     Raises:

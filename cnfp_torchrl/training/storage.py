@@ -32,11 +32,11 @@ def prepare_buffer(
     are stored for the states only in which they are not. Without constraints nothing is done.
 
     Args:
-        buffer: an empty buffer that overwrites the oldest transitions first.
-        env: the environment that publishes what is to be stored.
-        state_keys: entries of a state that the actor reads.
-        other_keys: entries that the loss reads besides states, action, reward and ends.
-        constraint_bytes: memory that a stored transition may take for constraints.
+        buffer: An empty buffer that overwrites the oldest transitions first.
+        env: The environment that publishes what is to be stored.
+        state_keys: Entries of a state that the actor reads.
+        other_keys: Entries that the loss reads besides states, action, reward and ends.
+        constraint_bytes: The memory that a stored transition may take for constraints.
     """
     computed = SampledGeometry(env, constraints_to_sample(env, state_keys, constraint_bytes))
     stored = [key for key in state_keys if key not in computed.field_keys]

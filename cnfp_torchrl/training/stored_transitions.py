@@ -20,9 +20,9 @@ class StoredTransitions:
     storage, writer and transform. What a sampler has drawn is its own state.
 
     Args:
-        buffer: the buffer, empty, which overwrites its oldest transitions first.
-        path: the folder of the files.
-        is_saved: whether files are written at all; otherwise nothing is remembered for them.
+        buffer: The buffer, empty, which overwrites its oldest transitions first.
+        path: The folder of the files.
+        is_saved: Whether files are written at all; otherwise nothing is remembered for them.
     """
 
     def __init__(self, buffer: ReplayBuffer, path: Path, *, is_saved: bool = True) -> None:
@@ -58,7 +58,7 @@ class StoredTransitions:
         """Remove the files that no state needs any more.
 
         Args:
-            oldest: number of transitions at the oldest state that is kept.
+            oldest: The number of transitions at the oldest state that is kept.
         """
         overwritten = oldest - self._buffer.storage.max_size
         for end in self._ends():

@@ -27,11 +27,11 @@ class SweepRun:
     """One run of a sweep.
 
     Args:
-        path: the run's folder.
-        given: what was asked for, as Hydra's overrides.
-        state: done, failed, running, stopped or not started.
-        reason: why it failed, or where it stopped.
-        summary: the run's summary; empty where it is not done.
+        path: The run's folder.
+        given: What was asked for, as Hydra's overrides.
+        state: Done, failed, running, stopped or not started.
+        reason: The reason why it failed, or where it stopped.
+        summary: The run's summary; empty where it is not done.
     """
 
     path: Path
@@ -82,8 +82,8 @@ class Mean:
     """A mean over seeds, with an interval.
 
     Args:
-        value: the mean.
-        half_width: half the width of its 95 % interval by Student's t; None for a single seed.
+        value: The mean.
+        half_width: Half the width of its 95 % interval by Student's t; None for a single seed.
     """
 
     value: float
@@ -110,8 +110,8 @@ def read_sweep(folder: Path, planned: Mapping[Path, Sequence[str]] | None = None
     """Return the runs in a folder, in the order of their numbers.
 
     Args:
-        folder: the sweep's folder.
-        planned: the overrides of all runs that the sweep was to have, by the folders meant for
+        folder: The sweep's folder.
+        planned: The overrides of all runs that the sweep was to have, by the folders meant for
             them; those that no folder holds are not started.
 
     Raises:

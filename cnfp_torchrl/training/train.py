@@ -67,9 +67,9 @@ def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dic
     """Train, evaluate and leave everything in the run's folder.
 
     Args:
-        config: configuration as composed from ``conf/train.yaml``.
-        folder: an empty run folder, or that of a run to go on with.
-        resume: go on where the run in the folder was saved last.
+        config: The configuration as composed from ``conf/train.yaml``.
+        folder: An empty run folder, or that of a run to go on with.
+        resume: Whether to go on where the run in the folder was saved last.
 
     Returns:
         The summary that is also written to ``summary.json``.
@@ -260,9 +260,9 @@ def _evaluations(
     """Evaluate the stochastic policy and the deterministic one.
 
     Args:
-        config: that of the run.
-        actor: the trained actor.
-        settings: number of episodes and the seed.
+        config: That of the run.
+        actor: The trained actor.
+        settings: The number of episodes and the seed.
     """
     with closing(_evaluation_environment(config, settings.episodes)) as env:
         return {

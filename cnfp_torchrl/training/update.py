@@ -14,7 +14,7 @@ class UpdateBudget:
     """The number of updates that are due, which need not be whole.
 
     Args:
-        ratio: updates for each environment step.
+        ratio: Updates for each environment step.
     """
 
     def __init__(self, ratio: float) -> None:
@@ -38,13 +38,14 @@ class Update:
     """A step of learning from a batch of transitions.
 
     Args:
-        loss: the loss; its outputs named ``loss_...`` are summed and descended.
-        optimizer: optimizer of the loss's parameters.
-        target: updater of the loss's target networks, if it has any, called after each step.
-        actor_every: number of steps of the critics for one of actor and targets; more than 1 needs
-            a loss with a ``critic_loss`` of its own, such as `ConstrainedTD3Loss`.
-        max_grad_norm: largest norm of the gradient, which is shortened to it; None leaves it.
-        compiled: compile the loss and its backward pass, which takes a minute or more, once.
+        loss: The loss; its outputs named ``loss_...`` are summed and descended.
+        optimizer: The optimizer of the loss's parameters.
+        target: The updater of the loss's target networks, if it has any, called after each step.
+        actor_every: The number of steps of the critics for one of actor and targets; more than 1
+            needs a loss with a ``critic_loss`` of its own, such as `ConstrainedTD3Loss`.
+        max_grad_norm: The largest norm of the gradient, which is shortened to it; None leaves it.
+        compiled: Whether to compile the loss and its backward pass, which takes a minute or more,
+            once.
     """
 
     def __init__(

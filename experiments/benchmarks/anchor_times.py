@@ -54,10 +54,10 @@ def facing_rows(
     """Return bounds and constraints: eight rows if it is one, else balls and pairs of rows.
 
     Args:
-        batch: number of states.
-        dim: dimension of the actions.
-        constraints: number of constraints.
-        relaxed: share of the states in which one of them cannot hold.
+        batch: The number of states.
+        dim: The dimension of the actions.
+        constraints: The number of constraints.
+        relaxed: The share of the states in which one of them cannot hold.
     """
     generator = torch.Generator().manual_seed(0)
 

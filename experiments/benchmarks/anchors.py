@@ -58,11 +58,11 @@ class Amount:
     """By how much one set gave way in one case, in action units.
 
     Args:
-        family: of the set.
-        dim: of the actions.
-        given: the set's largest row, less the leeway.
-        least: bounds of the least possible amount, given those of higher priority.
-        depth: that the set keeps.
+        family: The family of the set.
+        dim: The dimension d of the actions.
+        given: The set's largest row, less the leeway.
+        least: Bounds of the least possible amount, given those of higher priority.
+        depth: That the set keeps.
     """
 
     family: str
@@ -90,9 +90,9 @@ class Comparison:
     """What came out of one case.
 
     Args:
-        amounts: of all sets but the bounds.
-        attempted: whether a cheap attempt found an anchor.
-        share: the anchor's share of the best slack in the sets, widened where they are relaxed.
+        amounts: The amounts of all sets but the bounds.
+        attempted: Whether a cheap attempt found an anchor.
+        share: The anchor's share of the best slack in the sets, widened where they are relaxed.
     """
 
     amounts: list[Amount]
@@ -249,11 +249,11 @@ def largest_excess(
     """Return bounds of the largest t by which slacks of sets on trial exceed what is required.
 
     Args:
-        fixed: sets with the slacks that their rows must have.
-        trial: sets with the slacks that their rows exceed by t.
-        bounds: of the actions.
-        start: an action to begin at.
-        precision: how close the bounds shall come.
+        fixed: Sets with the slacks that their rows must have.
+        trial: Sets with the slacks that their rows exceed by t.
+        bounds: The bounds of the actions.
+        start: An action to begin at.
+        precision: How close the bounds shall come.
     """
     dim = len(start)
 

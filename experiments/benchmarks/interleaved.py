@@ -40,10 +40,10 @@ def rounds(
     GPU the process's own time on the processor counts, which waiting for one does not prolong.
 
     Args:
-        calls: calls by name.
-        count: number of rounds.
-        seconds: time that a call is repeated for in a round.
-        device: device whose work is waited for.
+        calls: Calls by name.
+        count: The number of rounds.
+        seconds: The time that a call is repeated for in a round.
+        device: The device whose work is waited for.
     """
     clock = time.perf_counter if device is not None and device.type == "cuda" else time.process_time
     repeats = {}
@@ -72,9 +72,10 @@ def compared(times: Mapping[str, list[float]], reference: str, work: int = 0) ->
     """Return medians in milliseconds, and ratios within a round to a reference with quartiles.
 
     Args:
-        times: seconds of each kind in each round.
-        reference: kind that the others are compared with.
-        work: number of things that a call does, for a column of how many a second; 0 leaves it out.
+        times: Seconds of each kind in each round.
+        reference: The kind that the others are compared with.
+        work: The number of things that a call does, for a column of how many a second; 0 leaves it
+            out.
     """
     rows: Rows = {}
     for name, values in times.items():
@@ -93,9 +94,9 @@ class Replay:
     Both begin in the same states, again and again, so that both go through the same ones.
 
     Args:
-        env: environment to step, plain or constrained.
-        recorded: rollout of the constrained actor, ``(*batch, steps)``.
-        start: arguments of a reset to where the rollout began.
+        env: The environment to step, plain or constrained.
+        recorded: The rollout of the constrained actor, ``(*batch, steps)``.
+        start: Arguments of a reset to where the rollout began.
     """
 
     def __init__(self, env: EnvBase, recorded: TensorDictBase, start: Mapping[str, Any]) -> None:
@@ -163,11 +164,11 @@ def write(
     """Write results to a JSON file, and as Markdown beside it.
 
     Args:
-        path: the JSON file.
-        title: of the page.
-        about: what the numbers depend on.
-        results: tables by title.
-        notes: sentences below the first ones.
+        path: The JSON file.
+        title: The title of the page.
+        about: What the numbers depend on.
+        results: Tables by title.
+        notes: Sentences below the first ones.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"about": about, "results": results}, indent=1) + "\n")

@@ -58,8 +58,9 @@ class Layer:
     """A layer on one batch of wished actions.
 
     Args:
-        forward: Returns allowed actions.
-        backward: Computes them, and the gradient of the sum of their squares; None without one.
+        forward: The function that returns allowed actions.
+        backward: The function that computes them, and the gradient of the sum of their squares;
+            None without one.
     """
 
     forward: Callable[[], Any]

@@ -70,9 +70,9 @@ class Settings:
     """How much is measured.
 
     Args:
-        quick: little, for a test.
-        count: number of rounds.
-        seconds: time of a call of each kind in a round.
+        quick: Whether to measure little, for a test.
+        count: The number of rounds.
+        seconds: The time of a call of each kind in a round.
     """
 
     quick: bool = False
@@ -215,11 +215,11 @@ def problem(
     relaxed ones the first set misses the action bounds.
 
     Args:
-        batch: number of states.
-        dim: number d of action components.
-        constraints: number K of sets.
-        tight: share of states that are tight.
-        relaxed: share of states in which a set gives way.
+        batch: The number of states.
+        dim: The number d of action components.
+        constraints: The number K of sets.
+        tight: The share of states that are tight.
+        relaxed: The share of states in which a set gives way.
     """
     generator = torch.Generator().manual_seed(0)
 

@@ -67,7 +67,7 @@ class EachStep:
     """Stream transitions of batch size ``()``, one after another, as evaluations do.
 
     Args:
-        stream: of the policy.
+        stream: The stream of the policy.
     """
 
     def __init__(self, stream: FlowStream) -> None:
@@ -89,11 +89,11 @@ def processor_time(
     """Return milliseconds of processor time and bytes of the file, for each step.
 
     Args:
-        env: of point navigation.
-        actor: its policy.
-        steps: what the way into the stream takes for a step; the first tenth warms up.
-        every: see `FlowStream`.
-        way: into the stream.
+        env: The environment of point navigation.
+        actor: Its policy.
+        steps: What the way into the stream takes for a step; the first tenth warms up.
+        every: See `FlowStream`.
+        way: The way into the stream.
     """
     warm_up = len(steps) // 10
     with tempfile.TemporaryDirectory() as folder:

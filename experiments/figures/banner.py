@@ -60,11 +60,11 @@ def flow_banner(
     The last caption counts violations among many further samples.
 
     Args:
-        snapshot: of an exact flow with two action components.
-        env: of a task with a map.
-        colors: of the constraints; None chooses them by name.
-        detail: how fine.
-        counted: number of the further samples.
+        snapshot: The snapshot of an exact flow with two action components.
+        env: The environment of a task with a map.
+        colors: The colors of the constraints; None chooses them by name.
+        detail: How fine.
+        counted: The number of the further samples.
     """
     scene, plane = (
         Scene(Setting.of(snapshot.head, env).holding(snapshot), snapshot, detail),

@@ -52,8 +52,8 @@ def changed(config: DictConfig, change: Callable[[Layout], Layout]) -> DictConfi
     """Return a run's configuration with every map in it changed.
 
     Args:
-        config: resolved; each part of it names its own map.
-        change: of the map.
+        config: The resolved configuration; each part of it names its own map.
+        change: The change of the map.
 
     Raises:
         ValueError: when there is no map in it.
@@ -76,7 +76,7 @@ def evaluate_afterwards(folder: RunFolder) -> dict[str, Evaluation]:
     """Return what a run's policy does in each changed task, by change.
 
     Args:
-        folder: a finished run; its configuration says how many episodes, from which seed.
+        folder: A finished run; its configuration says how many episodes, from which seed.
     """
     config = folder.load_config()
     return {name: evaluation(folder, changed(config, change)) for name, change in CHANGES.items()}

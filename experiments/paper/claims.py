@@ -67,8 +67,8 @@ class Evidence:
     """All that claims are judged by.
 
     Args:
-        runs: the records of each method.
-        hostile: what hostile networks did behind each flow, empty where that is not kept.
+        runs: The records of each method.
+        hostile: What hostile networks did behind each flow, empty where that is not kept.
     """
 
     runs: Mapping[str, Runs]
@@ -100,9 +100,9 @@ class Claim:
     """A claim about methods.
 
     Args:
-        statement: what is claimed.
-        rule: when which verdict falls, in words.
-        by: what judges it, by the evidence and for the method of one flow.
+        statement: What is claimed.
+        rule: When which verdict falls, in words.
+        by: What judges it, by the evidence and for the method of one flow.
     """
 
     statement: str

@@ -34,9 +34,9 @@ class Place(NamedTuple):
     """A state of point navigation.
 
     Args:
-        position: of the agent, in arena units.
-        battery: in percent.
-        goal: in arena units.
+        position: The position of the agent, in arena units.
+        battery: The battery in percent.
+        goal: The goal in arena units.
     """
 
     position: tuple[float, float]
@@ -66,8 +66,8 @@ class KeptPolicy(Kept):
     """The Gaussians that a network puts into `PLACES`.
 
     Args:
-        source: where they come from, in words.
-        gaussians: one for each place, by its name.
+        source: Where they come from, in words.
+        gaussians: One for each place, by its name.
     """
 
     source: Text
@@ -91,8 +91,8 @@ class FixedGaussian(nn.Module):
     """The same location and scale in every state.
 
     Args:
-        loc: location, ``(d,)``.
-        scale: scale, ``(d,)``.
+        loc: The location, ``(d,)``.
+        scale: The scale, ``(d,)``.
     """
 
     def __init__(self, loc: Tensor, scale: Tensor) -> None:
@@ -109,8 +109,8 @@ def find_policy(path: Path, runs: Path) -> KeptPolicy:
     """Return the kept policy; else keep that of a finished run; else `UNTRAINED`.
 
     Args:
-        path: of the kept policy.
-        runs: folder of runs; those of ``experiment=exact`` are in its folder ``exact``.
+        path: The path of the kept policy.
+        runs: The folder of runs; those of ``experiment=exact`` are in its folder ``exact``.
 
     Raises:
         ValueError: when what is there cannot be used, naming it.

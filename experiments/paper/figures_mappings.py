@@ -62,11 +62,12 @@ class MappingExample:
     """A bijection to draw.
 
     Args:
-        title: above its panel.
-        bijector: from the plane.
-        outlines: of the set that it maps onto, closed; a hole's runs the other way round.
-        context: further outlines, such as those of the action bounds.
-        first: a bijection after which the particles' ways are drawn, for a stage that does not
+        title: The title above its panel.
+        bijector: The bijector from the plane.
+        outlines: The outlines of the set that it maps onto, closed; a hole's runs the other way
+            round.
+        context: Further outlines, such as those of the action bounds.
+        first: A bijection after which the particles' ways are drawn, for a stage that does not
             start from the Gaussian itself.
     """
 
@@ -115,7 +116,7 @@ def draw_mappings(examples: Sequence[MappingExample] | None = None) -> Figure:
     tears the plane, lines of the web end.
 
     Args:
-        examples: one for each panel, after the first panel, which shows the Gaussian; None draws
+        examples: One for each panel, after the first panel, which shows the Gaussian; None draws
             `mapping_examples`.
     """
     examples = mapping_examples() if examples is None else examples

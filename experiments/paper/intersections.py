@@ -23,9 +23,9 @@ class Tried:
     """What became of samples of a standard normal in random cases.
 
     Args:
-        cases: how many of the cases were of the kind looked for.
-        outside: share of the samples of all these cases outside a set that was judged, by flow.
-        broken: number of cases with such a sample, by flow.
+        cases: How many of the cases were of the kind looked for.
+        outside: The share of the samples of all these cases outside a set that was judged, by flow.
+        broken: The number of cases with such a sample, by flow.
     """
 
     cases: int
@@ -38,7 +38,7 @@ def intersecting(*families: type[Ball] | type[Box]) -> Tried:
     """Judge all sets where all have points in common.
 
     Args:
-        families: of the constraints, in order of application.
+        families: The families of the constraints, in order of application.
     """
     region = _random_region(families)
     assert region.active is not None

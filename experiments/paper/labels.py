@@ -11,10 +11,10 @@ class Label:
     """A method as readers meet it.
 
     Args:
-        name: for readers.
-        color: as ``#RRGGBB``.
-        marker: of matplotlib; tells methods apart where colors do not.
-        baseline: whether it cares about the constraints in another way than the exact flow.
+        name: The name for readers.
+        color: The color as ``#RRGGBB``.
+        marker: The marker of matplotlib; tells methods apart where colors do not.
+        baseline: Whether it cares about the constraints in another way than the exact flow.
     """
 
     name: str

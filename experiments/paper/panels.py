@@ -23,12 +23,12 @@ def draw_band(axes: Axes, label: Label, band: Band, *, place: int, of: int) -> N
     """Draw a method's curve and the band of its intervals.
 
     Args:
-        axes: a panel.
-        label: of the method.
-        band: what is drawn.
-        place: of the method among those of the panel; the first lies above the others, and markers
-            stand apart, so that curves that coincide, as at 0, can still be told.
-        of: number of methods in the panel.
+        axes: A panel.
+        label: The label of the method.
+        band: What is drawn.
+        place: The place of the method among those of the panel; the first lies above the others,
+            and markers stand apart, so that curves that coincide, as at 0, can still be told.
+        of: The number of methods in the panel.
     """
     x, every, layer = band.steps, max(of, len(band.steps) // _MARKS), of - place
     axes.fill_between(
@@ -53,11 +53,11 @@ def draw_estimates(
     """Draw one row for each method: its runs as faint dots, the estimate and its interval.
 
     Args:
-        axes: an empty panel; the first method comes at the top.
-        labels: of the methods.
-        estimates: one for each, None where there is none.
-        runs: the values behind each estimate.
-        absent: what to say where there is no estimate, one for each.
+        axes: An empty panel; the first method comes at the top.
+        labels: The labels of the methods.
+        estimates: One for each, None where there is none.
+        runs: The values behind each estimate.
+        absent: What to say where there is no estimate, one for each.
     """
     for row in range(1, len(labels), 2):
         axes.axhspan(row - 0.5, row + 0.5, color="#F4F4F6", linewidth=0, zorder=0)
@@ -89,9 +89,9 @@ def count_axis(axis: Axis, highest: float, *, smallest: float = 1.0) -> None:
     """Make an axis of counts logarithmic, and linear below some count, so that 0 is a place on it.
 
     Args:
-        axis: x or y of a panel.
-        highest: the largest count to show.
-        smallest: where the logarithmic part starts, a power of ten.
+        axis: The x or y axis of a panel.
+        highest: The largest count to show.
+        smallest: Where the logarithmic part starts, a power of ten.
     """
     first = round(np.log10(smallest))
     last = max(first + 1, int(np.ceil(np.log10(max(highest, smallest) * 1.05))))
@@ -133,9 +133,9 @@ def spread_labels(
     """Write each method's name beside its point, none over another.
 
     Args:
-        axes: a panel with its final limits.
-        points: x and y in data units, and the method.
-        gap: between two names, as a share of the panel's height.
+        axes: A panel with its final limits.
+        points: X and y in data units, and the method.
+        gap: The gap between two names, as a share of the panel's height.
     """
     to_share = axes.transData + axes.transAxes.inverted()
     places = [to_share.transform((x, y)) for x, y, _ in points]

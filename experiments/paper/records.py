@@ -52,8 +52,8 @@ class Series(Kept):
     """A scalar over training.
 
     Args:
-        steps: environment steps since the start, strictly rising.
-        values: one for each of the steps.
+        steps: The environment steps since the start, strictly rising.
+        values: One for each of the steps.
     """
 
     steps: Annotated[tuple[Count, ...], Field(min_length=1)]
@@ -73,12 +73,12 @@ class Outcome(Kept):
     """What a policy did in whole episodes.
 
     Args:
-        return_mean: mean undiscounted return of an episode.
-        return_standard_error: of that mean.
-        score: the mean return on the task's scale.
-        violations: violating steps by constraint, all episodes together.
-        episodes: number of episodes.
-        steps: environment steps, all episodes together.
+        return_mean: The mean undiscounted return of an episode.
+        return_standard_error: The standard error of that mean.
+        score: The mean return on the task's scale.
+        violations: Violating steps by constraint, all episodes together.
+        episodes: The number of episodes.
+        steps: The environment steps, all episodes together.
     """
 
     return_mean: float
@@ -110,21 +110,21 @@ class Record(Kept):
     """One finished run.
 
     Args:
-        format: what kind of file this is.
-        version: of that format.
-        method: name of its experiment, a file of ``conf/experiment``.
-        seed: of everything random.
-        overrides: what was given to the trainer beside experiment and seed.
-        config: the training configuration, every interpolation resolved.
-        versions: of Python and of the packages that decide the numbers.
-        commit: of the repository, None where it is not known.
-        steps: environment steps of training.
-        seconds: wall time of training and evaluation; runs beside it slow it down.
-        curves: logged scalars by name: return, cumulative violations of each constraint, processor
+        format: What kind of file this is.
+        version: The version of that format.
+        method: The name of its experiment, a file of ``conf/experiment``.
+        seed: The seed of everything random.
+        overrides: What was given to the trainer beside experiment and seed.
+        config: The training configuration, every interpolation resolved.
+        versions: The versions of Python and of the packages that decide the numbers.
+        commit: The commit of the repository, None where it is not known.
+        steps: The environment steps of training.
+        seconds: The wall time of training and evaluation; runs beside it slow it down.
+        curves: Logged scalars by name: return, cumulative violations of each constraint, processor
             seconds, and whatever else the method logs.
-        training_violations: violating steps by constraint while training.
-        evaluation: of the trained policy.
-        afterwards: the same policy after a change of the task that it was not trained for, by the
+        training_violations: Violating steps by constraint while training.
+        evaluation: The evaluation of the trained policy.
+        afterwards: The same policy after a change of the task that it was not trained for, by the
             change's name; empty where that was not evaluated.
     """
 
@@ -203,10 +203,10 @@ class HostileRun(Kept):
     """One hostile network behind one flow.
 
     Args:
-        flow: name of the flow's configuration.
-        network: name of the network.
-        steps: environment steps.
-        violations: violating steps by constraint.
+        flow: The name of the flow's configuration.
+        network: The name of the network.
+        steps: The environment steps.
+        violations: Violating steps by constraint.
     """
 
     model_config = ConfigDict(extra="ignore")

@@ -65,9 +65,9 @@ class Gathered:
     """Everything that the report is made of.
 
     Args:
-        evidence: the records that can be used, one or more, and what hostile networks did.
-        problems: a sentence for whatever cannot.
-        policy: whose flow is drawn.
+        evidence: The records that can be used, one or more, and what hostile networks did.
+        problems: A sentence for whatever cannot.
+        policy: Whose flow is drawn.
     """
 
     evidence: Evidence
@@ -81,9 +81,9 @@ class Judged:
 
     Args:
         kind: "Claim" of the paper, or "Aim" of this project.
-        number: of all claims and aims.
-        claim: what is claimed.
-        found: by flow.
+        number: The number of all claims and aims.
+        claim: What is claimed.
+        found: What was found by flow.
     """
 
     kind: str
@@ -102,8 +102,8 @@ def write_report(folder: Path) -> Path:
     """Draw the figures and write the pages, and return where the first is.
 
     Args:
-        folder: with records in ``data/``. The pictures of the flow take their Gaussians from its
-            ``policy.json``, or from a finished run in its ``runs/``.
+        folder: The folder with records in ``data/``. The pictures of the flow take their Gaussians
+            from its ``policy.json``, or from a finished run in its ``runs/``.
 
     Raises:
         RecordError: when there is no usable record at all, naming what is wrong.
@@ -120,8 +120,8 @@ def gather(folder: Path, *, hostile: Path = HOSTILE) -> Gathered:
     """Read everything, and name what cannot be used.
 
     Args:
-        folder: see `write_report`.
-        hostile: the kept result of ``experiments/hostile_networks.py``.
+        folder: See `write_report`.
+        hostile: The kept result of ``experiments/hostile_networks.py``.
 
     Raises:
         RecordError: see `write_report`.

@@ -77,12 +77,12 @@ def do_run(
     """Train and keep the record, unless it is there already; return what was done, in words.
 
     Args:
-        config: of the training, as composed.
-        method: name of the experiment.
-        overrides: what was given beside experiment and seed.
-        folder: of this run. Each attempt has a folder in it, those of killed ones are left as they
-            are; a finished attempt is not repeated.
-        data: folder of the records.
+        config: The configuration of the training, as composed.
+        method: The name of the experiment.
+        overrides: What was given beside experiment and seed.
+        folder: The folder of this run. Each attempt has a folder in it, those of killed ones are
+            left as they are; a finished attempt is not repeated.
+        data: The folder of the records.
 
     Raises:
         RecordError: when the record that is there cannot be read.
@@ -115,9 +115,9 @@ def make_record(folder: RunFolder, method: str, overrides: list[str]) -> Record:
     """Return the record of a finished run, with what its policy does afterwards.
 
     Args:
-        folder: of a run with the CSV logger.
-        method: see `do_run`.
-        overrides: see `do_run`.
+        folder: The folder of a run with the CSV logger.
+        method: See `do_run`.
+        overrides: See `do_run`.
     """
     summary = json.loads((folder.path / SUMMARY).read_text())
     curves = read_scalars(folder.path / "metrics")
@@ -149,7 +149,7 @@ def settings(config: Mapping[Any, Any]) -> dict[str, Any]:
     """Return what decides a run's result, as JSON would give it back.
 
     Args:
-        config: plain data, with every interpolation resolved.
+        config: Plain data, with every interpolation resolved.
     """
     return json.loads(
         json.dumps({name: value for name, value in config.items() if name not in PRESENTATION})

@@ -29,10 +29,10 @@ class Interval(NamedTuple):
     """An interquartile mean over runs, or a difference of two.
 
     Args:
-        value: the mean.
-        low: lower end of its bootstrap interval; the value itself for a single run.
-        high: upper end.
-        runs: number of runs, of the method with fewer.
+        value: The mean.
+        low: The lower end of its bootstrap interval; the value itself for a single run.
+        high: The upper end.
+        runs: The number of runs, of the method with fewer.
     """
 
     value: float

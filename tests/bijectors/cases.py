@@ -55,13 +55,13 @@ class Case:
     """One bijector, and what it stands for.
 
     Args:
-        name: for the test's id.
-        kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft, soft-rays,
-            soft-alone or recession.
-        sets: in order of application, float64 of values that float32 holds too.
-        anchor: of the kinds that have one, ``(*batch, d)``.
-        active: which sets hold, ``(*batch, len(sets))``; None means all.
-        smooth: whether the log-density has bounded gradients everywhere.
+        name: The name for the test's id.
+        kind: The kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft,
+            soft-rays, soft-alone or recession.
+        sets: The sets in order of application, float64 of values that float32 holds too.
+        anchor: The anchor of the kinds that have one, ``(*batch, d)``.
+        active: Which sets hold, ``(*batch, len(sets))``; None means all.
+        smooth: Whether the log-density has bounded gradients everywhere.
     """
 
     name: str
@@ -222,11 +222,11 @@ class Maker:
     """Make random sets that hold a common anchor with a given slack.
 
     Args:
-        dim: d.
-        batch_shape: of everything that is made.
-        size: the half-width of the action bounds.
-        slack: the anchor's least distance to each boundary, in units of `size`.
-        offset: how far from 0 the bounds lie, in units of `size`.
+        dim: The dimension d.
+        batch_shape: The batch shape of everything that is made.
+        size: The half-width of the action bounds.
+        slack: The anchor's least distance to each boundary, in units of `size`.
+        offset: How far from 0 the bounds lie, in units of `size`.
     """
 
     def __init__(

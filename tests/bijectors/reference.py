@@ -38,9 +38,9 @@ def contains(
     """Tell, in NumPy, whether actions lie in a set, on the exact values of all tensors.
 
     Args:
-        each: the set.
+        each: The set.
         action: ``(*sample, *batch, d)``.
-        number: the type to compute in, longer than the tensors' own: its rounding errors must be
+        number: The type to compute in, longer than the tensors' own: its rounding errors must be
             far below the distance of two neighboring actions.
     """
     a = action.detach().numpy().astype(number)

@@ -49,9 +49,9 @@ class RoundedOtherwise(TorchDispatchMode):
     """A processor on which each inexact result is off by at most some units in the last place.
 
     Args:
-        most: how many units.
-        seed: of the errors; one computation done twice comes out differently.
-        operations: whose results are off.
+        most: How many units.
+        seed: The seed of the errors; one computation done twice comes out differently.
+        operations: Whose results are off.
     """
 
     def __init__(self, most: int = 1, seed: int = 0, operations: frozenset[str] = INEXACT) -> None:

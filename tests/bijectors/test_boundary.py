@@ -31,9 +31,9 @@ class Edge:
     """A bijector whose boundary is looked at.
 
     Args:
-        name: for the test's id.
-        case: its dimension, its batch and the size of its numbers.
-        make: the bijector, of sets whose numbers are changed by a function of them.
+        name: The name for the test's id.
+        case: Its dimension, its batch and the size of its numbers.
+        make: The bijector, of sets whose numbers are changed by a function of them.
     """
 
     name: str

@@ -28,10 +28,10 @@ class Kind:
     """Random regions of some families.
 
     Args:
-        families: of the sets after the action bounds.
-        dim: d.
-        size: half-width of the action bounds.
-        rounds: of Dykstra's algorithm; few, so that the last step has something to do.
+        families: The families of the sets after the action bounds.
+        dim: The dimension d.
+        size: The half-width of the action bounds.
+        rounds: The rounds of Dykstra's algorithm; few, so that the last step has something to do.
     """
 
     families: tuple[Family, ...]

@@ -14,6 +14,7 @@ from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, Poin
 from cnfp_torchrl.training.networks import gaussian_network
 from experiments.exported import DIMENSIONS, policy_of
 from tests.deploy.conftest import actor_for, point_nav
+from tests.point_nav import make_rate_limited_env
 
 
 def test_it_acts_as_the_actor_does(env: TransformedEnv) -> None:
@@ -25,7 +26,7 @@ def test_it_acts_as_the_actor_does(env: TransformedEnv) -> None:
     # Where the first attempt was enough for the environment, too: elsewhere it has searched on.
     shown = policy.states(states["observation"])
     sets = [policy.bounds.on(None), *policy.sets(shown)]
-    anchor, _ = attempt_anchor(sets, shown["constraints", "safe_action"], steps=0)
+    anchor, _ = attempt_anchor(sets, steps=0)
     same = certified & (anchor == states["constraints", "anchor"]).all(-1)
     assert same.float().mean() > 0.9
     expected = actor.get_dist(states).deterministic_sample
@@ -54,6 +55,22 @@ def test_self_test_counts(env: TransformedEnv) -> None:
     assert found["violations"] == found["certified"] == 500
     assert found["fallback_out_of_bounds"] == 500
     assert found["largest_difference"] > 4
+
+
+def test_parts_of_a_vector_are_inputs_in_its_place() -> None:
+    env = make_rate_limited_env((4,))
+    actor = actor_for(env, size=7)
+    policy = DeployedPolicy(actor, env)
+    assert policy.input_keys == ["previous_action", "observation"]
+    assert [tuple(example.shape) for example in policy.examples(3)] == [(3, 2), (3, 5)]
+    found = self_test(policy, policy, observed_states(policy, env, actor, 200))
+    assert found["certified"] == 200
+    assert found["violations"] == 0
+    states = env.rollout(3, actor).reshape(-1)
+    inputs = states["previous_action"], states["observation"][:, :5]
+    torch.testing.assert_close(policy.states(*inputs)["observation"], states["observation"])
+    expected = actor.get_dist(states).deterministic_sample
+    torch.testing.assert_close(policy(*inputs)[0], expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", DIMENSIONS)

@@ -101,7 +101,7 @@ def test_sets_stand_beside_each_other_and_belong_to_their_state() -> None:
         torch.testing.assert_close(
             data["constraints", "speed", "center"], again["constraints", "speed", "center"]
         )
-    assert set(rollout["constraints"].keys()) == {"obstacle", "battery", "safe_action", "speed"}
+    assert set(rollout["constraints"].keys()) == {"obstacle", "battery", "speed"}
 
 
 def test_a_replay_buffer_computes_instead_of_storing() -> None:

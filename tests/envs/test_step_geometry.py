@@ -14,9 +14,10 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 
 from cnfp_torchrl import Ball, GeometryTransform, HalfSpaces, constrain_env
 from cnfp_torchrl.envs import constraint_bijectors
-from cnfp_torchrl.geometry import GeometryError
+from cnfp_torchrl.geometry import Evidence, GeometryError
 from cnfp_torchrl.modules import ConstrainedFlowModule, SafeRandomPolicy
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from tests.host_reads import HostReads
 
 
 class Brake(GeometryTransform):
@@ -113,6 +114,65 @@ def test_geometry_that_is_alone_publishes_itself(interpreted: list[Callable[...,
     battery = env.transform[0].clone()
     other = TransformedEnv(PointNavEnv([2], seed=0), battery)
     assert ("constraints", "battery", "center") in other.rollout(2)["next"].keys(True)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_stored_states_are_filled_in_within_an_episode(together: bool) -> None:
+    """By an environment's own transforms: its steps go on in one pass, with the same results."""
+    env, other = point_nav(False), point_nav(False)
+    state = env.rand_action(env.reset())
+    other.reset()
+    stored = state.select("observation")
+    transforms = [env.transform] if together else list(env.transform)
+    for transform in transforms:
+        stored = transform(stored)
+    assert (stored["constraints"] == state["constraints"]).all()
+    assert all(geometry.is_published_by_another for geometry in list(env.transform)[:2])
+    assert (env.step(state.clone()) == other.step(state.clone())).all()
+
+
+def test_a_reset_reads_all_checks_at_once() -> None:
+    env = point_nav(False)
+    state = env.reset()
+    with HostReads() as reads:
+        again = env.reset(position=state["observation"][:, :2], battery=60)
+    assert [line.rpartition(" ")[2] for line in reads.lines if "cnfp_torchrl/envs/" in line] == [
+        "tolist"
+    ]
+    assert again["constraints", "anchor"].shape == (5, 2)
+    # What is appended or taken away between two resets counts.
+    env.insert_transform(2, Brake("brake"))
+    assert ("constraints", "brake", "offsets") in env.reset().keys(True)
+    alone = TransformedEnv(env.base_env, deepcopy(env.transform[0]))
+    assert ("constraints", "battery", "radius") in alone.reset().keys(True)
+
+
+def test_a_geometry_whose_anchor_was_taken_away_publishes_itself() -> None:
+    env = point_nav(False)
+    env.reset()
+    env.transform.pop(2)
+    assert ("constraints", "obstacle", "low") in env.rollout(3)["next"].keys(True)
+
+
+class Contradicting(Ball):
+    """A family that tells of values beyond a limit, and finds none when it is asked which."""
+
+    def evidence(self) -> list[Evidence]:
+        return [*super().evidence(), Evidence(self.center[..., 0].amax(), 0.0)]
+
+
+class Contradiction(GeometryTransform):
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        x = tensordict["observation"][..., :2]
+        return Contradicting(x, torch.full_like(x[..., 0], 2.0), validate_args=False)
+
+
+@pytest.mark.parametrize("with_anchor", [True, False])
+def test_values_beyond_limits_end_the_episode_though_none_is_found(with_anchor: bool) -> None:
+    env = constrain_env(PointNavEnv([1]), Contradiction("odd"), with_anchor=with_anchor)
+    state = env.reset(position=(0.0, 0.0)).set("action", torch.tensor([[1.0, 0.0]]))
+    with pytest.raises(GeometryError, match=r"\['odd'\]: expected values within the limits"):
+        env.step(state)
 
 
 ROOM = [1.0]

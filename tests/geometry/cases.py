@@ -40,10 +40,10 @@ class Case:
     """A batch of sets of one family.
 
     Args:
-        name: id of the test.
-        sets: sets in float64, of numbers that float32 holds too.
-        inside: points well inside the sets, ``(*batch, d)``.
-        size: width of the sets in action units, roughly.
+        name: The id of the test.
+        sets: Sets in float64, of numbers that float32 holds too.
+        inside: Points well inside the sets, ``(*batch, d)``.
+        size: The width of the sets in action units, roughly.
     """
 
     name: str

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry import Box, ConstraintSet, HalfSpaces, PositivePart, attempt_anchor
+from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, PositivePart, attempt_anchor
 from cnfp_torchrl.geometry.anchor import chebyshev_center, row_depths
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
 from experiments.benchmarks.anchors import random_sets
@@ -32,6 +32,31 @@ def test_attempts_decide_all_families(case: Case) -> None:
     assert (decided.flatten() | (best < 2 * depth)).all()
     slack = least_slack(flat, anchor.reshape(-1, anchor.shape[-1])).double()
     assert (slack >= 0.3 * best)[decided.flatten()].all()
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4])
+def test_a_ball_beside_boxes_is_decided_in_closed_form(dim: int) -> None:
+    """Without steps: in every state whose best slack is more than the depth, however small."""
+    generator = torch.Generator().manual_seed(dim)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(2000, *shape, generator=generator, dtype=torch.float64)
+
+    low = normal(dim) - 0.5
+    box = Box(low, low + normal(dim).abs())
+    # Balls from afar, whose boundary crosses the box, and far beyond it.
+    center, room = normal(dim) * 10 ** normal(1), normal().abs() * 10 ** (2 * normal() - 1)
+    nearest = center.clamp(*Box(-torch.ones(dim), torch.ones(dim)).fields().values())
+    radius = (nearest.clamp(box.low, box.high) - center).norm(dim=-1) + room
+    bounds = Box(-torch.ones(2000, dim).double(), torch.ones(2000, dim).double())
+    sets = [bounds, box, Ball(center, radius)]
+    anchor, decided = attempt_anchor(sets, steps=0)
+    best = chebyshev_center(sets, share=0.99)
+    depth = torch.cat(row_depths(sets), -1).amax(-1)
+    assert 500 < decided.sum() < 1900
+    assert (decided | (best.slack < 4 * depth)).all()
+    assert not (decided & (best.upper_bound < depth)).any()
+    assert (least_slack(sets, anchor) >= 0.3 * best.slack)[decided].all()
 
 
 def shape_of(case: Case) -> torch.Size:

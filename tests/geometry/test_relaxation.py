@@ -20,7 +20,6 @@ from cnfp_torchrl.geometry import (
     TaskSpaceBall,
     VisibleRegion,
     WeightedL1Ball,
-    attempt_anchor,
     lexicographic_anchor,
     relaxation_floor,
 )
@@ -267,39 +266,3 @@ def test_gradients_and_densities_stay_bounded(relaxed: str) -> None:
         .max()
         < 20
     )
-
-
-class Attempt(torch.nn.Module):
-    """A cheap attempt as a program of tensors alone."""
-
-    def forward(self, low: Tensor, high: Tensor, *fields: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the anchors and whether they do."""
-        rows, offsets, center, radius = fields
-        return attempt_anchor(
-            [
-                Box(low, high, validate_args=False),
-                HalfSpaces(rows, offsets, validate_args=False),
-                Ball(center, radius, validate_args=False),
-            ]
-        )
-
-
-def test_attempts_are_one_graph_and_export() -> None:
-    torch._dynamo.reset()
-    generator = torch.Generator().manual_seed(0)
-    normal, radius = (torch.randn(40, 4, 2, generator=generator, dtype=torch.float64) for _ in "ab")
-    fields = (
-        *BOUNDS.fields().values(),
-        normal[:, :2],
-        0.3 * radius[:, :2, 0],
-        0.5 * normal[:, 2],
-        0.4 * radius[:, 3, 0].abs(),
-    )
-    expected, decided = Attempt()(*fields)
-    assert 0.1 < decided.double().mean() < 0.9
-    compiled = torch.compile(Attempt(), backend="aot_eager", fullgraph=True)
-    exported = torch.export.export(Attempt(), fields).module()
-    for program in (compiled, exported):
-        anchor, flag = program(*fields)
-        assert (flag == decided).all()
-        torch.testing.assert_close(anchor[decided], expected[decided])

@@ -216,6 +216,16 @@ class SmallBoundingBox(PlainBall):
         return Bounds(self.center - half, self.center + half)
 
 
+class DeepestInTheMiddle(PlainBall):
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return (box.low + box.high) / 2
+
+
+class DeepestOutside(PlainBall):
+    def deepest_within(self, box: Bounds) -> Tensor:
+        return self.center
+
+
 class SuperlevelElsewhere(PlainBall):
     def superlevel(self) -> Cone:
         cone = Ball.superlevel(self)
@@ -302,6 +312,8 @@ BROKEN: list[tuple[type[ConstraintSet], str]] = [
     (AroundNotWritten, "around"),
     (DroppedByInfinity, "unless_dropped"),
     (SmallBoundingBox, "bounding_box"),
+    (DeepestInTheMiddle, "deepest_within"),
+    (DeepestOutside, "deepest_within"),
     (SuperlevelElsewhere, "superlevel"),
     (SuperlevelOfAPart, "superlevel"),
     (InflatedByAShare, "inflated"),

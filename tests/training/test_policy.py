@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import RenameTransform, TransformedEnv
+from torchrl.envs import CatTensors, ObservationNorm, RenameTransform, TransformedEnv
 
-from cnfp_torchrl import Ball, GeometryTransform, constrain_env, make_constrained_actor
+from cnfp_torchrl import Ball, Box, GeometryTransform, constrain_env, make_constrained_actor
 from cnfp_torchrl.configuration import compose_config, foreign_packages
 from cnfp_torchrl.geometry import GeometryError
 from cnfp_torchrl.modules import ConstraintViolationError
@@ -19,6 +19,7 @@ from cnfp_torchrl.training.networks import gaussian_network
 from cnfp_torchrl.training.policy import TrainedPolicy, load_policy
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
+from tests.point_nav import make_rate_limited_env
 
 from .conftest import TINY
 
@@ -94,6 +95,12 @@ class AsBefore(GeometryTransform):
         return Ball(center, torch.full_like(center[..., 0], 0.2), validate_args=False)
 
 
+class Everywhere(GeometryTransform):
+    def constraint_set(self, tensordict: TensorDictBase) -> Box:
+        zero = 0 * tensordict["observation"][..., :2]
+        return Box(zero - 1, zero + 1, validate_args=False)
+
+
 class Nested(AsBefore):
     def constraint_set(self, tensordict: TensorDictBase) -> Ball:
         return super().constraint_set(tensordict["far"])
@@ -126,6 +133,45 @@ def test_nested_entries_are_taken_as_gymnasium_nests_them() -> None:
     assert torch.equal(action, same)
     with pytest.raises(ValueError, match=r"\('far', 'cost'\) is missing"):
         policy({"observation": observation, "far": cost})
+
+
+def test_a_concatenated_vector_may_be_given_by_its_parts() -> None:
+    """Of which geometry reads one, and the first has the vector's own name."""
+    env = make_rate_limited_env((3,))
+    actor = make_constrained_actor(gaussian_network(7, 2, hidden=[4]), env)
+    policy = TrainedPolicy(actor, env)
+    assert policy.in_keys == ["previous_action", "observation"]
+    rollout: Any = env.rollout(4, actor).detach()
+    state, previous = rollout["observation"].split([5, 2], -1)
+    action = policy({"observation": state, "previous_action": previous})
+    assert torch.equal(action, policy({name: rollout[name] for name in policy.in_keys}))
+    assert ((action - previous).abs() <= 0.2).all()
+    with pytest.raises(ValueError, match=r"'observation': expected shape \(\*batch, 5\)"):
+        policy({"observation": state[..., 1:], "previous_action": previous})
+    with pytest.raises(ValueError, match="'previous_action' is missing"):
+        policy({"observation": state})
+
+
+def test_what_a_robot_observes_is_concatenated_as_in_training() -> None:
+    names = [("arm", "state"), "load"]
+    base = TransformedEnv(PointNavEnv([1]), RenameTransform(["observation", "cost"], names))
+    base.append_transform(CatTensors(names, "observation", sort=False))
+    env = constrain_env(base, Everywhere("box"))
+    policy = TrainedPolicy(make_constrained_actor(gaussian_network(7, 2, hidden=[4]), env), env)
+    assert policy.in_keys == names
+    state, load = np.ones(5), np.zeros(2)
+    given: Any = {"arm": {"state": state}, "load": load}
+    action = policy(given)
+    assert isinstance(action, np.ndarray)
+    np.testing.assert_array_equal(action, policy(np.concatenate([state, load])))
+
+
+def test_a_vector_that_changes_behind_the_geometries_is_refused() -> None:
+    env = constrain_env(PointNavEnv([1]), Everywhere("box"))
+    env.append_transform(ObservationNorm(0.0, 2.0, in_keys=["observation"]))
+    actor = make_constrained_actor(gaussian_network(5, 2, hidden=[4]), env)
+    with pytest.raises(ValueError, match=r"no transform that changes.*ObservationNorm"):
+        TrainedPolicy(actor, env)
 
 
 @pytest.mark.parametrize("given", [None, 3])

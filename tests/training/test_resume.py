@@ -277,9 +277,13 @@ def test_an_older_state_serves_where_the_newest_is_broken(
 ) -> None:
     newest = max((stopped / STATES).glob("state-*"))
     newest.write_bytes(newest.read_bytes()[:1000])
+    # What a kill leaves of a file that is being written.
+    for path in (newest, stopped / "summary.json", *(stopped / "tensorboard").iterdir()):
+        path.with_name(f".{path.name}.0123abcd.partial").write_bytes(b"half")
     with pytest.warns(BrokenCheckpointWarning, match=r"state-0*128\.pt.*goes on at step 64"):
         go_on(stopped)
     assert not differences(whole, stopped)
+    assert not list(stopped.rglob("*.partial"))
 
 
 def test_on_a_full_disk_the_states_before_stay(

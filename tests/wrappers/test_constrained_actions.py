@@ -91,7 +91,7 @@ def test_info_shows_the_geometry_of_the_state_it_comes_with() -> None:
     observation, info = env.reset(seed=3)
     for _ in range(30):
         shown = info["constraints"]
-        assert set(shown) == {"battery", "obstacle", "anchor", "safe_action"}
+        assert set(shown) == {"battery", "obstacle", "anchor"}
         assert shown["battery"]["active"].item() is True
         assert shown["battery"]["relaxation"] == 0
         ball = Ball(*(torch.tensor(shown["battery"][f]) for f in ("center", "radius")))

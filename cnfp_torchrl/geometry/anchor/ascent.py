@@ -51,11 +51,11 @@ class Ascent:
     """Points that move inwards, and upper bounds of the best slack.
 
     Args:
-        sets: sets of batch shapes that broadcast to that of the start; the first are the action
+        sets: Sets of batch shapes that broadcast to that of the start; the first are the action
             bounds. Sets without a `superlevel` are left out, and of non-convex ones a convex part
             counts.
-        start: points within the bounds, ``(*batch, d)``.
-        upper: upper bounds of the best slack, such as half of the bounds' width, ``(*batch,)``.
+        start: Points within the bounds, ``(*batch, d)``.
+        upper: Upper bounds of the best slack, such as half of the bounds' width, ``(*batch,)``.
     """
 
     def __init__(self, sets: Sequence[ConstraintSet], start: Tensor, upper: Tensor) -> None:
@@ -87,9 +87,9 @@ class Ascent:
         """Take steps until all points are deep enough or cannot be, and tell which are.
 
         Args:
-            steps: largest number of steps.
-            share: share of the best slack that is enough.
-            depth: least slack that is enough, ``(*batch,)``.
+            steps: The largest number of steps.
+            share: The share of the best slack that is enough.
+            depth: The least slack that is enough, ``(*batch,)``.
 
         Returns:
             Points ``(B, d)``, upper bounds of the best slack, and whether the points are deep
@@ -211,9 +211,9 @@ def _steepness(root: Tensor, height: Tensor, move: Tensor) -> Tensor:
     """Return the inverse of the largest step that does not leave a cone, ``(1, B)``.
 
     Args:
-        root: matrix R of the cone's curvature, ``(k, d + 1, B)``.
-        height: distance h of the level from the cone's tip, ``(B,)``.
-        move: step in point and level, ``(d + 1, B)``.
+        root: The matrix R of the cone's curvature, ``(k, d + 1, B)``.
+        height: The distance h of the level from the cone's tip, ``(B,)``.
+        move: Step in point and level, ``(d + 1, B)``.
     """
     # It is left where h^2 - |w|^2 is 0, a quadratic in the step.
     image = root[:, -1] * height

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,8 +11,9 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
-from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
+from cnfp_torchrl.geometry.anchor.depth import EROSIONS, bounds_of, depth_in_boxes, row_depths
+from cnfp_torchrl.geometry.box import Box
+from cnfp_torchrl.geometry.constraint_set import Bounds, ConstraintSet, broadcast_shape
 
 STEPS = 4
 """The number of steps inwards; more would decide tighter states, which the search takes now."""
@@ -20,6 +23,9 @@ REFINEMENT = 5
 
 SHARE = 0.3
 """The share of the best slack that is enough for an attempt."""
+
+INWARDS = 0.33
+"""The least share of the best slack that points next to sets' deepest ones keep from boxes."""
 
 
 @torch.no_grad()
@@ -33,8 +39,8 @@ def attempt_anchor(
 
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds.
-        candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        steps: number of steps inwards, 0 or more.
+        candidate: Points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
+        steps: The number of steps inwards, 0 or more.
 
     Returns:
         Points ``(*batch, d)``, and the flags of those that are anchors, boolean ``(*batch,)``: they
@@ -44,10 +50,9 @@ def attempt_anchor(
     Raises:
         GeometryError: when the first set is no box.
     """
-    depths = row_depths(sets)
-    found = first_attempt(sets, depths, candidate)
+    found = first_attempt(sets, candidate)
     if steps:
-        found = further_attempt(sets, depths, found, steps)
+        found = further_attempt(sets, found, steps)
     return found.anchor, found.decided
 
 
@@ -73,90 +78,105 @@ class Attempt(NamedTuple):
         return Attempt(anchor, self.upper.view(shape), self.decided.view(shape))
 
 
-def first_attempt(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], candidate: Tensor | None
-) -> Attempt:
-    """Try the middle of all bounding boxes, 0, and points between a candidate and the middle."""
-    low, high = _bounding_box(sets)
-    middle = (low + high) / 2
-    points = [middle, torch.zeros_like(middle).clamp(low, high)]
-    if candidate is not None:
-        points += [torch.lerp(candidate, middle, share) for share in (0.0, 0.25, 0.5, 0.75)]
+def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Attempt:
+    r"""Try the middle of all bounding boxes, a point that sets of closed form agree on, and others.
+
+    Where a ball is all there is beside boxes, the points find the best slack t up to a share of
+    :math:`1 / (1 + \sqrt d)`: no point of the boxes has more slack in the ball than the one next to
+    its center, which loses :math:`\sqrt d\, s` at most by moving inwards by s in each component.
+
+    Args:
+        sets: sets of batch shapes that broadcast, the first of them the box of action bounds.
+        candidate: points that may lie in all sets, ``(*batch, d)``.
+    """
+    box = _bounding_box(sets)
+    low, high = box
     # No point has more slack than the middle of all boxes has in the boxes.
-    return _roomiest(sets, depths, points, (high - low).amin(-1) / 2)
+    upper = (high - low).amin(-1) / 2
+    middle = torch.lerp(low, high, 0.5)
+    points = [middle]
+    deepest = []
+    for constraint_set in sets[1:]:
+        if (point := constraint_set.deepest_within(box)) is not None:
+            upper = torch.minimum(upper, constraint_set.slack(point))
+            deepest.append(point)
+    if deepest:
+        inwards = (upper * max(INWARDS, 1 / (1 + math.sqrt(box.low.shape[-1])))).unsqueeze(-1)
+        wanted = deepest[0] if len(deepest) == 1 else torch.stack(deepest).mean(0)
+        points.append(torch.clamp(wanted, low + inwards, high - inwards))
+    if candidate is not None:
+        points += [candidate, torch.lerp(candidate, middle, 0.5)]
+    if not all(map(_is_described, sets)):
+        points.append(torch.zeros_like(middle).clamp(low, high))
+    return _roomiest(sets, box, points, upper)
 
 
-def no_attempt(sets: Sequence[ConstraintSet]) -> Attempt:
-    """Return the middle of all bounding boxes, untried: where steps inwards begin by trying it."""
-    low, high = _bounding_box(sets)
-    bounds, shape = bounds_of(sets), broadcast_shape(*(s.batch_shape for s in sets))
-    middle = ((low + high) / 2).clamp(bounds.low, bounds.high).expand(*shape, bounds.dim)
-    undecided = torch.zeros(shape, dtype=torch.bool, device=middle.device)
-    return Attempt(middle, (high - low).amin(-1) / 2, undecided)
+def _is_described(constraint_set: ConstraintSet) -> bool:
+    """Tell whether steps inwards see all of a set, so that they make up for a first attempt."""
+    kind = type(constraint_set)
+    described = kind.superlevel is not ConstraintSet.superlevel
+    return described and kind.part_near is ConstraintSet.part_near
 
 
-def _bounding_box(sets: Sequence[ConstraintSet]) -> tuple[Tensor, Tensor]:
+def _bounding_box(sets: Sequence[ConstraintSet]) -> Bounds:
     """Return bounds of all sets."""
-    boxes = [constraint_set.bounding_box() for constraint_set in sets]
-    low, high = boxes[0]
-    for box in boxes[1:]:
-        low, high = torch.maximum(low, box.low), torch.minimum(high, box.high)
-    return low, high
+    box = bounds_of(sets).bounding_box()
+    for constraint_set in sets[1:]:
+        other = constraint_set.bounding_box()
+        box = Bounds(torch.maximum(box.low, other.low), torch.minimum(box.high, other.high))
+    return box
 
 
-def further_attempt(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt, steps: int
-) -> Attempt:
+def further_attempt(sets: Sequence[ConstraintSet], before: Attempt, steps: int) -> Attempt:
     """Take some steps inwards from where an attempt ended."""
     ascent = Ascent(sets, before.anchor, before.upper)
     ascent.run(steps)
-    return _roomiest(sets, depths, [ascent.point, before.anchor], ascent.bound)
+    return _roomiest(sets, _bounding_box(sets), [ascent.point, before.anchor], ascent.bound)
 
 
-def refined_attempt(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], before: Attempt
-) -> Attempt:
+def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
-        sets: sets of batch shapes that broadcast.
-        depths: depths of their rows (`row_depths`), ``(*batch, m)`` for each set.
-        before: attempt to start from, ``(*batch,)``.
+        sets: Sets of batch shapes that broadcast.
+        before: The attempt to start from, ``(*batch,)``.
 
     Returns:
         The attempts in all states, side by side.
     """
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
-        return further_attempt(sets, depths, before, STEPS).select()
-    largest = depths[0].amax(-1)
-    for depth in depths[1:]:
-        largest = torch.maximum(largest, depth.amax(-1))
+        return further_attempt(sets, before, STEPS).select()
+    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
     return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
 
 
-def select_states(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], shape: torch.Size, index: Tensor
-) -> tuple[list[ConstraintSet], list[Tensor]]:
-    """Return sets and depths of some states, by their flat indices in a batch shape."""
-    some = [depth.expand(*shape, depth.shape[-1]) for depth in depths]
-    some = [depth.reshape(-1, depth.shape[-1])[index] for depth in some]
-    return [s.select(shape, index) for s in sets], some
-
-
 def _roomiest(
-    sets: Sequence[ConstraintSet], depths: Sequence[Tensor], points: Sequence[Tensor], upper: Tensor
+    sets: Sequence[ConstraintSet], box: Bounds, points: Sequence[Tensor], upper: Tensor
 ) -> Attempt:
-    """Choose the points with the most slack beyond the largest depth of each set."""
+    """Choose the points with the most slack beyond what an anchor needs.
+
+    Args:
+        sets: sets of batch shapes that broadcast, the first of them the box of action bounds.
+        box: bounds of all sets, in which all slacks in boxes are at least what they are in it.
+        points: points ``(*batch, d)``.
+        upper: upper bounds of the best slack, ``(*batch,)``.
+    """
+    bounds = bounds_of(sets)
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
-    slacks = [s.slack(stacked) for s in sets]
-    room, slack = slacks[0] - depths[0].amax(-1), slacks[0]
-    for each, depth in zip(slacks[1:], depths[1:], strict=True):
-        room, slack = torch.minimum(room, each - depth.amax(-1)), torch.minimum(slack, each)
-    room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
-    slack = slack.gather(0, best).squeeze(0)
-    # Not take_along_dim, with which an exported program would be one for a single batch size.
-    index = best.unsqueeze(-1).expand(1, *shape, stacked.shape[-1])
-    anchor = stacked.gather(0, index).squeeze(0)
-    return Attempt(anchor, upper, (room.squeeze(0) >= 0) & (slack >= SHARE * upper))
+    # No box has a larger rounding error than the bounds, whose largest coordinate is theirs.
+    needed = torch.maximum(SHARE * upper, depth_in_boxes(bounds))
+    room = torch.minimum(box.high - stacked, stacked - box.low).amin(-1) - needed
+    for constraint_set in sets[1:]:
+        if not isinstance(constraint_set, Box):
+            rounding = constraint_set.rounding(bounds.magnitude())
+            largest = rounding.squeeze(-1) if rounding.shape[-1] == 1 else rounding.amax(-1)
+            beyond = torch.maximum(needed, EROSIONS * largest)
+            room = torch.minimum(room, constraint_set.slack(stacked) - beyond)
+    # Not by `max` and its index, as gathering takes longer than choosing between two.
+    (most, *rooms), (anchor, *others) = room.nan_to_num(nan=-torch.inf).unbind(), stacked.unbind()
+    for each, point in zip(rooms, others, strict=True):
+        anchor = torch.where((each > most).unsqueeze(-1), point, anchor)
+        most = torch.maximum(most, each)
+    return Attempt(anchor, upper, most >= 0)

@@ -26,8 +26,8 @@ def maximize_slack_over_box(problem: Program, start: Array, settled: Settled) ->
 
     Args:
         problem: B problems, in which the bounds of the actions must hold.
-        start: points strictly inside of what is not on trial, ``(B, d)``.
-        settled: function that tells which problems need no more work.
+        start: Points strictly inside of what is not on trial, ``(B, d)``.
+        settled: The function that tells which problems need no more work.
     """
     with np.errstate(all="ignore"):
         best = _best_over_box(problem, start)

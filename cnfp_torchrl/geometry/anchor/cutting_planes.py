@@ -33,12 +33,12 @@ def maximize_slack_by_cuts(
 
     Args:
         problem: B problems, without the sets.
-        sets: further sets, each of batch shape ``(B,)``, in float64 on the CPU.
-        required: slacks that those on trial exceed by t, ``(B, len(sets))``.
-        trial: flags of the sets on trial, ``(B, len(sets))``.
-        counts: flags of the sets that count, ``(B, len(sets))``.
-        start: points strictly inside of all that must hold, ``(B, d)``.
-        settled: function that tells which problems need no more work.
+        sets: Further sets, each of batch shape ``(B,)``, in float64 on the CPU.
+        required: Slacks that those on trial exceed by t, ``(B, len(sets))``.
+        trial: Flags of the sets on trial, ``(B, len(sets))``.
+        counts: Flags of the sets that count, ``(B, len(sets))``.
+        start: Points strictly inside of all that must hold, ``(B, d)``.
+        settled: The function that tells which problems need no more work.
     """
     batch = len(start)
     found = Best(start.copy(), np.full(batch, -np.inf), np.full(batch, np.inf))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry.box import Box
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet, GeometryError
+from cnfp_torchrl.geometry.constraint_set import EROSION_IN_EPS, ConstraintSet, GeometryError
 
 DEPTH = 2.5e-5
 """The least slack of an anchor in every set, as a share of the smallest width of the bounds.
@@ -48,9 +48,13 @@ def bounds_of(sets: Sequence[ConstraintSet]) -> Box:
     return bounds
 
 
-def smallest_width(bounds: Box) -> Tensor:
-    """Return the width of the action bounds in their narrowest component, ``(*batch,)``."""
-    return (bounds.high - bounds.low).amin(-1)
+def depth_in_boxes(bounds: Box) -> Tensor:
+    """Return the depth that the anchor has in each row of a box, at most, ``(*batch,)``.
+
+    It is that of the action bounds: in no box are there larger coordinates of actions.
+    """
+    largest = EROSIONS * EROSION_IN_EPS * torch.finfo(bounds.dtype).eps
+    return torch.maximum(DEPTH * bounds.smallest_width(), largest * bounds.magnitude())
 
 
 def row_depths(sets: Sequence[ConstraintSet]) -> list[Tensor]:
@@ -60,9 +64,9 @@ def row_depths(sets: Sequence[ConstraintSet]) -> list[Tensor]:
     width is that of the action bounds, the erosion what `ConstraintSet.eroded` takes off the row.
 
     Args:
-        sets: sets, the first of them the box of action bounds.
+        sets: Sets, the first of them the box of action bounds.
     """
     bounds = bounds_of(sets)
-    least = (DEPTH * smallest_width(bounds)).unsqueeze(-1)
+    least = (DEPTH * bounds.smallest_width()).unsqueeze(-1)
     magnitude = bounds.magnitude()
     return [torch.maximum(EROSIONS * s.rounding(magnitude), least) for s in sets]

@@ -42,11 +42,11 @@ class Slacks(NamedTuple):
     """Slacks at points.
 
     Attributes:
-        value: slacks of all M inequalities, ``(M, B)``: of the sides of the boxes, and behind them
+        value: Slacks of all M inequalities, ``(M, B)``: of the sides of the boxes, and behind them
             of rows, cones and sums.
-        least: smallest ones, ``(B,)``.
-        images: vectors w of the cones, ``(k, B)`` each.
-        lengths: their lengths, ``(1, B)`` each.
+        least: The smallest ones, ``(B,)``.
+        images: Vectors w of the cones, ``(k, B)`` each.
+        lengths: Their lengths, ``(1, B)`` each.
     """
 
     value: Tensor
@@ -64,12 +64,13 @@ class Derivatives(NamedTuple):
     """Inequalities at points and levels, and their derivatives in both.
 
     Attributes:
-        room: by how much all inequalities hold, ``(M, B)``.
-        gradient: gradients of those behind the boxes, ``(M - 2 d, d + 1, B)``.
-        roots: matrices R of the cones' curvatures :math:`2 R^T R / h`, ``(k, d + 1, B)`` each.
-        heights: half heights :math:`h / 2` of the cones, ``(B,)`` each.
-        curvatures: curvatures of the sums along each component, ``(d, B)`` each.
-        gains: by how much slacks of sums lie above their linearizations at most, ``(B,)`` each.
+        room: The amount by which all inequalities hold, ``(M, B)``.
+        gradient: Gradients of those behind the boxes, ``(M - 2 d, d + 1, B)``.
+        roots: Matrices R of the cones' curvatures :math:`2 R^T R / h`, ``(k, d + 1, B)`` each.
+        heights: Half heights :math:`h / 2` of the cones, ``(B,)`` each.
+        curvatures: Curvatures of the sums along each component, ``(d, B)`` each.
+        gains: The amounts by which slacks of sums lie above their linearizations at most, ``(B,)``
+            each.
     """
 
     room: Tensor
@@ -89,9 +90,9 @@ class Inequalities:
     """The inequalities of some sets, in half widths x of the bounds about their middle.
 
     Args:
-        sets: sets of batch shapes that broadcast; the first are the action bounds. Sets without a
+        sets: Sets of batch shapes that broadcast; the first are the action bounds. Sets without a
             `superlevel` are left out, and of non-convex ones a convex part counts.
-        shape: their batch shape, with B elements.
+        shape: Their batch shape, with B elements.
     """
 
     def __init__(self, sets: Sequence[ConstraintSet], shape: torch.Size) -> None:
@@ -180,10 +181,10 @@ class Inequalities:
         """Return rooms and derivatives at points and at levels below all slacks.
 
         Args:
-            x: points, ``(d, B)``.
-            at: slacks at the points.
-            level: levels ``(B,)``.
-            width: widths over which the terms of a sum are rounded off, ``(B,)``.
+            x: Points, ``(d, B)``.
+            at: Slacks at the points.
+            level: Levels ``(B,)``.
+            width: Widths over which the terms of a sum are rounded off, ``(B,)``.
         """
         room = at.value - level
         gradients = [] if self.normals is None else [self.normals]

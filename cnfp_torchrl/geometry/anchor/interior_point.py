@@ -37,10 +37,10 @@ class Best(NamedTuple):
     """The best found actions, and what certifies that there are none much better.
 
     Attributes:
-        action: actions, ``(B, d)``.
-        slack: their slacks, ``(B,)``.
-        upper_bound: upper bounds of the slack, ``(B,)``.
-        weights: weights of sums, rows and cones in these bounds, in sum 1 for those on trial, NaN
+        action: Actions, ``(B, d)``.
+        slack: Their slacks, ``(B,)``.
+        upper_bound: Upper bounds of the slack, ``(B,)``.
+        weights: Weights of sums, rows and cones in these bounds, in sum 1 for those on trial, NaN
             where no weights were needed, ``(R, B)``; None where they are not known.
     """
 
@@ -64,8 +64,8 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
 
     Args:
         problem: B problems, with rows that bound the actions on all sides.
-        start: points strictly inside of what is not on trial, ``(B, d)``.
-        settled: function that tells which problems need no more work.
+        start: Points strictly inside of what is not on trial, ``(B, d)``.
+        settled: The function that tells which problems need no more work.
     """
     # Some of the problems that go on after they are settled may end in infinities.
     with np.errstate(all="ignore"):
@@ -107,18 +107,18 @@ class _Path:
     """Points and weights of B problems on their way.
 
     Args:
-        rows: rows of the program, ``(M, n, B)``.
-        offsets: their offsets, ``(M, B)``.
-        cones: cones of the program, ``(J, 1 + k, n, B)``.
-        tips: their constants, ``(J, 1 + k, B)``.
+        rows: Rows of the program, ``(M, n, B)``.
+        offsets: Their offsets, ``(M, B)``.
+        cones: Cones of the program, ``(J, 1 + k, n, B)``.
+        tips: Their constants, ``(J, 1 + k, B)``.
         rates: 1 for rows and cones on trial and 0 for the others, ``(M + J, B)``.
         spare: 0 for what is on trial and infinite for the others, ``(M + J, B)``.
-        low: least values of all unknowns but t, ``(n, B)``.
-        high: largest values of all unknowns but t, ``(n, B)``.
-        x: unknowns, ``(n, B)``.
-        weights: weights of the rows, ``(M, B)``.
-        duals: weights of the cones, ``(J, 1 + k, B)``.
-        dim: number d of components of an action, after which t stands in x.
+        low: Least values of all unknowns but t, ``(n, B)``.
+        high: Largest values of all unknowns but t, ``(n, B)``.
+        x: Unknowns, ``(n, B)``.
+        weights: Weights of the rows, ``(M, B)``.
+        duals: Weights of the cones, ``(J, 1 + k, B)``.
+        dim: The number d of components of an action, after which t stands in x.
     """
 
     rows: Array
@@ -251,8 +251,8 @@ def _limits(point: Array, changes: Array) -> Array:
     """Return the inverse of the largest steps of slacks and weights of cones, ``(2, B)``.
 
     Args:
-        point: slacks, which are as large as the weights, in the scaling of the step.
-        changes: what a step takes off the slacks and off the weights, ``(2, J, 1 + k, B)``.
+        point: Slacks, which are as large as the weights, in the scaling of the step.
+        changes: What a step takes off the slacks and off the weights, ``(2, J, 1 + k, B)``.
     """
     # A cone is left where point - step * changes has a determinant of 0, a quadratic.
     det, along = _det(point), (_flipped(point) * changes).sum(2)
@@ -265,9 +265,9 @@ class ConeScaling(NamedTuple):
     r"""The symmetric scaling W of cones with :math:`W z = W^{-1} s` for slacks s and weights z.
 
     Args:
-        head: first components of the axes, which are of determinant 1, ``(J, B)``.
-        tail: other components of the axes, ``(J, k, B)``.
-        size: sizes ``(J, B)``.
+        head: The first components of the axes, which are of determinant 1, ``(J, B)``.
+        tail: Other components of the axes, ``(J, k, B)``.
+        size: Sizes ``(J, B)``.
     """
 
     head: Array

@@ -23,13 +23,13 @@ class Intersection:
     """B intersections of sets, whose R rows stand side by side, in the order of the sets.
 
     Args:
-        sets: in float64 on the CPU, of batch shape ``(B,)``; the first is the finite box of action
-            bounds.
-        widths: the number of rows of each set, R in sum.
-        program: the inequalities that describe the sets, or of non-convex ones a convex part.
-        described: the row of each of the program's inequalities, ``(M,)``.
-        own: the sets that tell their slacks themselves, because no description of them does.
-        plain: those of them that have no description.
+        sets: The sets in float64 on the CPU, of batch shape ``(B,)``; the first is the finite box
+            of action bounds.
+        widths: The number of rows of each set, R in sum.
+        program: The inequalities that describe the sets, or of non-convex ones a convex part.
+        described: The row of each of the program's inequalities, ``(M,)``.
+        own: The sets that tell their slacks themselves, because no description of them does.
+        plain: Those of them that have no description.
     """
 
     sets: Sequence[ConstraintSet]
@@ -44,8 +44,8 @@ class Intersection:
         """Describe sets of batch shape ``(B,)`` in any dtype, on any device.
 
         Args:
-            sets: the first is the finite box of action bounds.
-            widths: number of rows of each set; None counts them.
+            sets: The first is the finite box of action bounds.
+            widths: The number of rows of each set; None counts them.
 
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
@@ -132,12 +132,12 @@ class Intersection:
         """Find the largest t by which the slacks of rows on trial exceed what is required of them.
 
         Args:
-            required: slacks of all rows, ``(B, R)``.
-            trial: which rows are on trial, ``(B, R)``; all others must have what is required, and
+            required: Slacks of all rows, ``(B, R)``.
+            trial: The mask of rows on trial, ``(B, R)``; all others must have what is required, and
                 do at the start.
-            counts: which rows count at all, ``(B, R)``.
-            start: points strictly inside of what the rows not on trial require, ``(B, d)``.
-            settled: tells which problems need no more work.
+            counts: Which rows count at all, ``(B, R)``.
+            start: Points strictly inside of what the rows not on trial require, ``(B, d)``.
+            settled: The function that tells which problems need no more work.
         """
         at = self.described
         problem = self.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)

@@ -25,11 +25,9 @@ from torch import Tensor
 from cnfp_torchrl.geometry.anchor.attempts import (
     Attempt,
     first_attempt,
-    no_attempt,
     refined_attempt,
-    select_states,
 )
-from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths, smallest_width
+from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
@@ -52,20 +50,18 @@ class Begun(NamedTuple):
     """The rule after its cheapest attempts, which decide many states.
 
     Attributes:
-        sets: sets in order of application.
-        depths: depths of their rows.
-        attempt: points, and whether they are anchors.
+        sets: Sets in order of application.
+        attempt: Points, and whether they are anchors.
     """
 
     sets: Sequence[ConstraintSet]
-    depths: list[Tensor]
     attempt: Attempt
 
     def all_held(self) -> Anchored:
         """Return the anchors of states that are all decided: all sets hold."""
         shape, anchor = self.attempt.decided.shape, self.attempt.anchor
         active = torch.ones(*shape, len(self.sets), dtype=torch.bool, device=anchor.device)
-        amounts = tuple(depth.new_zeros(*shape, depth.shape[-1]) for depth in self.depths)
+        amounts = tuple(anchor.new_zeros(*shape, s.row_count()) for s in self.sets)
         return Anchored(anchor, active, amounts)
 
 
@@ -74,13 +70,10 @@ def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None)
     """Make the attempts that take the least time, and read no tensor on the host.
 
     Args:
-        sets: sets in order of application, as in `lexicographic_anchor`.
-        candidate: points that may lie in all sets, ``(*batch, d)``.
+        sets: Sets in order of application, as in `lexicographic_anchor`.
+        candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
-    depths = row_depths(sets)
-    if candidate is None and all(map(_is_described, sets)):
-        return Begun(sets, depths, no_attempt(sets))
-    return Begun(sets, depths, first_attempt(sets, depths, candidate))
+    return Begun(sets, first_attempt(sets, candidate))
 
 
 def lexicographic_anchor(
@@ -99,8 +92,8 @@ def lexicographic_anchor(
     Args:
         sets: K + 1 sets in order of application; ``sets[0]`` is the finite box of action bounds,
             which always holds, and the last has the highest priority.
-        candidate: points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
-        leeway: amount by which rows are relaxed beyond the least one, as a share of the bounds'
+        candidate: Points that may lie in all sets, such as a known safe action, ``(*batch, d)``.
+        leeway: The amount by which rows are relaxed beyond the least one, as a share of the bounds'
             smallest width; positive.
 
     Raises:
@@ -116,13 +109,12 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
     """Take steps inwards and search in the states that are not decided yet.
 
     Args:
-        begun: what `begin_anchor` returned.
-        leeway: leeway, as in `lexicographic_anchor`.
+        begun: What `begin_anchor` returned.
+        leeway: Leeway, as in `lexicographic_anchor`.
     """
     if not leeway > 0:
         raise ValueError(f"leeway: expected a number > 0, given {leeway}")
-    sets, depths, found = begun
-    bounds = bounds_of(sets)
+    sets, found = begun
     shape = found.decided.shape
     _, active, relaxation = begun.all_held()
     found = found.select()
@@ -132,19 +124,16 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
         # Steps inwards for the states that need them, and the search for those that need more.
         some = shape
         if len(left) < len(anchor):
-            sets, depths = select_states(sets, depths, shape, left)
+            sets = [s.select(shape, left) for s in sets]
             some, found = left.shape, found.select(left)
-        refined = refined_attempt(sets, depths, found.view(some))
+        refined = refined_attempt(sets, found.view(some))
         anchor = anchor.index_copy(0, left, refined.anchor)
-        if bool(refined.decided.all()):
-            left = left[:0]
-        else:
-            hard = (~refined.decided).nonzero().squeeze(-1)
-            sets, depths = select_states(sets, depths, some, hard)
-            found, left = refined.select(hard), left[hard]
+        hard = (~refined.decided).nonzero().squeeze(-1)
+        sets = [s.select(some, hard) for s in sets] if len(hard) else sets
+        found, left = refined.select(hard), left[hard]
     if len(left):
-        margin = leeway * _flat(smallest_width(bounds).unsqueeze(-1), shape)[left].squeeze(-1)
-        searched = Search.of(sets, depths, margin).run(found.anchor, found.upper)
+        margin = leeway * bounds_of(sets).smallest_width()
+        searched = Search.of(sets, row_depths(sets), margin).run(found.anchor, found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active.to(active.device))
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
@@ -162,10 +151,10 @@ def relaxation_floor(sets: Sequence[ConstraintSet], leeway: float = LEEWAY) -> T
     this much at most. A larger relaxation means that a constraint could not hold.
 
     Args:
-        sets: sets in order of application, as in `lexicographic_anchor`.
-        leeway: leeway, as in `lexicographic_anchor`.
+        sets: Sets in order of application, as in `lexicographic_anchor`.
+        leeway: Leeway, as in `lexicographic_anchor`.
     """
-    more = leeway * smallest_width(bounds_of(sets))
+    more = leeway * bounds_of(sets).smallest_width()
     floors = [(1 + 2 * PRECISION) * depth.amax(-1) + more for depth in row_depths(sets)]
     return torch.stack(torch.broadcast_tensors(*floors), -1)
 
@@ -186,9 +175,9 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Cheby
     counts.
 
     Args:
-        sets: sets of batch shape ``(B,)``, the first a finite box.
-        share: share of the best slack that is enough, below 1; where the best slack is negative,
-            the one found is lower by at most ``1 - share`` of it.
+        sets: Sets of batch shape ``(B,)``, the first a finite box.
+        share: The share of the best slack that is enough, below 1; where the best slack is
+            negative, the one found is lower by at most ``1 - share`` of it.
 
     Returns:
         Actions ``(B, d)``, their slacks ``(B,)`` and upper bounds of the best slacks ``(B,)``.
@@ -209,15 +198,3 @@ def chebyshev_center(sets: Sequence[ConstraintSet], share: float = 0.5) -> Cheby
     best = everything.maximize(np.zeros(rows.shape), rows, rows, middle, settled)
     like = next(iter(sets[0].fields().values()))
     return ChebyshevCenter(*(torch.from_numpy(value).to(like.device) for value in best[:3]))
-
-
-def _is_described(constraint_set: ConstraintSet) -> bool:
-    """Tell whether steps inwards see all of a set, so that they can do without a first attempt."""
-    kind = type(constraint_set)
-    described = kind.superlevel is not ConstraintSet.superlevel
-    return described and kind.part_near is ConstraintSet.part_near
-
-
-def _flat(rows: Tensor, shape: torch.Size) -> Tensor:
-    """Return values ``(*batch, m)`` of all batch elements, ``(B, m)``."""
-    return rows.expand(*shape, rows.shape[-1]).reshape(-1, rows.shape[-1])

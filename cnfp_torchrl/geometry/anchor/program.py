@@ -34,17 +34,17 @@ class Program:
     that does not count has no coefficients, and holds by 1 everywhere.
 
     Args:
-        rows: coefficients of ``rows @ x <= offsets``, ``(M, n, B)``: the terms of kinked sums, the
+        rows: Coefficients of ``rows @ x <= offsets``, ``(M, n, B)``: the terms of kinked sums, the
             sums, and other rows.
-        offsets: offsets of the rows, ``(M, B)``.
-        loose: offsets that let every action pass, for rows that do not count, ``(M, B)``.
-        cones: coefficients of ``tips - cones @ x``, whose first component is no less than the norm
+        offsets: Offsets of the rows, ``(M, B)``.
+        loose: Offsets that let every action pass, for rows that do not count, ``(M, B)``.
+        cones: Coefficients of ``tips - cones @ x``, whose first component is no less than the norm
             of the others, ``(J, 1 + k, n, B)``.
-        tips: constants of the cones, ``(J, 1 + k, B)``.
-        middle: middles of the bounds, ``(d, B)``.
-        half: half widths of the bounds, ``(d, B)``.
-        unit: mean half widths, ``(B,)``.
-        reach: largest values of the terms of sums, whose least ones are 0, ``(n - d - 1, B)``.
+        tips: Constants of the cones, ``(J, 1 + k, B)``.
+        middle: Middles of the bounds, ``(d, B)``.
+        half: Half widths of the bounds, ``(d, B)``.
+        unit: The mean half widths, ``(B,)``.
+        reach: Largest values of the terms of sums, whose least ones are 0, ``(n - d - 1, B)``.
     """
 
     rows: Array
@@ -62,8 +62,8 @@ class Program:
         """Stack descriptions, each with batch shape ``(B,)``: kinked sums, rows and cones.
 
         Args:
-            parts: descriptions in float64, one for each set.
-            bounds: finite bounds of the actions, ``(B, d)``.
+            parts: Descriptions in float64, one for each set.
+            bounds: Finite bounds of the actions, ``(B, d)``.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
@@ -121,9 +121,9 @@ class Program:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
-            required: slacks ``(R, B)`` required of all sums, rows and cones, in this order.
-            trial: flags of those that exceed it by t, ``(R, B)``; the others need no more than it.
-            counts: flags of those that count at all, ``(R, B)``.
+            required: Slacks ``(R, B)`` required of all sums, rows and cones, in this order.
+            trial: Flags of those that exceed it by t, ``(R, B)``; the others need no more than it.
+            counts: Flags of those that count at all, ``(R, B)``.
         """
         first, dim, needs = len(self.reach) * 2, self.dim, required / self.unit
         split = len(self.rows) - first
@@ -152,10 +152,10 @@ class Program:
         """Return the problems with rows added, where they count.
 
         Args:
-            normals: normals of the rows, ``(m, d, B)``, of slacks that are not divided further.
-            offsets: offsets of the rows, ``(m, B)``.
-            trial: flags of the rows on trial, ``(m, B)``.
-            counts: flags of the rows that count, ``(m, B)``.
+            normals: Normals of the rows, ``(m, d, B)``, of slacks that are not divided further.
+            offsets: Offsets of the rows, ``(m, B)``.
+            trial: Flags of the rows on trial, ``(m, B)``.
+            counts: Flags of the rows that count, ``(m, B)``.
         """
         rows = np.zeros((len(normals), *self.rows.shape[1:]))
         rows[:, : self.dim] = normals * (self.half / self.unit) * counts[:, None]

@@ -30,12 +30,12 @@ def retreat(
 
     Args:
         some: B intersections.
-        best: points of the least relaxation.
-        before: points strictly inside of the rows that were not on trial, ``(B, d)``.
-        required: slacks that were required of the rows, ``(B, R)``.
-        gain: amounts by which the rows gave way, ``(B, R)``.
-        counts: flags of the rows that counted, ``(B, R)``.
-        sure: flags of those of them that hold or have given way, ``(B, R)``; the others may.
+        best: Points of the least relaxation.
+        before: Points strictly inside of the rows that were not on trial, ``(B, d)``.
+        required: Slacks that were required of the rows, ``(B, R)``.
+        gain: Amounts by which the rows gave way, ``(B, R)``.
+        counts: Flags of the rows that counted, ``(B, R)``.
+        sure: Flags of those of them that hold or have given way, ``(B, R)``; the others may.
 
     Returns:
         Points ``(B, d)``, and upper bounds of the smallest room in the rows that counted, ``(B,)``.

@@ -33,9 +33,9 @@ class Anchored(NamedTuple):
     active, infinite: only families that cannot be inflated, `ConstraintSet.can_be_inflated`).
 
     Attributes:
-        anchor: points well inside the region, ``(*batch, d)``.
-        active: flags of the sets that hold as stated, boolean ``(*batch, K + 1)``.
-        relaxation: amounts by which the m rows of each set are widened, ``(*batch, m)`` for each.
+        anchor: Points well inside the region, ``(*batch, d)``.
+        active: Flags of the sets that hold as stated, boolean ``(*batch, K + 1)``.
+        relaxation: Amounts by which the m rows of each set are widened, ``(*batch, m)`` for each.
     """
 
     anchor: Tensor
@@ -54,9 +54,9 @@ class Search:
     counts yet, and for each state a point strictly inside of the rows that count.
 
     Args:
-        everything: sets of the states.
-        depth: depths of all rows, ``(B, R)``.
-        leeway: amounts of relaxation beyond the least ones, ``(B,)``.
+        everything: Sets of the states.
+        depth: Depths of all rows, ``(B, R)``.
+        leeway: Amounts of relaxation beyond the least ones, ``(B,)``.
     """
 
     def __init__(self, everything: Intersection, depth: Array, leeway: Array) -> None:
@@ -84,8 +84,8 @@ class Search:
         """Apply the rule.
 
         Args:
-            start: points to start from, ``(B, d)``.
-            upper: upper bounds of the best slack in all sets, if they are convex, ``(B,)``.
+            start: Points to start from, ``(B, d)``.
+            upper: Upper bounds of the best slack in all sets, if they are convex, ``(B,)``.
         """
         # Sets may lie at infinity, as far as float64 knows.
         with np.errstate(all="ignore"):
@@ -196,7 +196,7 @@ class Search:
         """Move to points well inside of some rows where there are such, and tell where.
 
         Args:
-            rows: flags of the rows, those of the bounds among them, ``(B, R)``.
+            rows: Flags of the rows, those of the bounds among them, ``(B, R)``.
         """
         found = self._roomiest(self.everything, rows)
         fits = found.slack >= 0
@@ -224,9 +224,9 @@ class Search:
         """Find points with most slack beyond what rows require, or that there are none.
 
         Args:
-            part: sets of the states at the index.
-            rows: flags of the rows that count, ``(B, R)``.
-            index: indices of the states; None means all.
+            part: Sets of the states at the index.
+            rows: Flags of the rows that count, ``(B, R)``.
+            index: Indices of the states; None means all.
         """
         index = np.arange(len(rows)) if index is None else index
         chosen = rows[index]

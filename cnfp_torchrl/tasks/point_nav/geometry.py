@@ -15,7 +15,7 @@ the way to the nearest station by `ShortestPath`, its turns charged. The two set
 
 from one step to the next for every allowed action, and leave an action open in every such state: 0
 violations at any time. On the reference layout every start is such a state, the way is the straight
-line to the nearest station, and the safe action lies at least 0.04 action units inside both sets.
+line to the nearest station, and a move along it lies at least 0.04 action units inside both sets.
 On other layouts it holds from starts with that property, where passages are wider than twice the
 clearance of `ShortestPath`. The obstacle's part alone holds from every position outside the
 rectangles.
@@ -39,7 +39,6 @@ from cnfp_torchrl.envs import GeometryTransform
 from cnfp_torchrl.geometry import (
     Ball,
     Box,
-    ConstraintSet,
     GeometryError,
     VisibleOrBox,
     VisibleRegion,
@@ -51,9 +50,6 @@ from cnfp_torchrl.tasks.point_nav.shortest_path import (
     ShortestPath,
     StationWay,
 )
-
-SAFE_SPEED = 0.95
-"""The safe action's length, in steps: between the cautious speed that plans count on and 1."""
 
 _BEYOND = 2.0
 """Sets for states in which no action keeps the constraint begin here, outside the bounds of 1."""
@@ -131,19 +127,6 @@ class ObstacleGeometry(PointNavGeometry):
     """
 
     usual_name = "obstacle"
-    _half: Tensor
-    _signs: Tensor
-
-    def __init__(
-        self,
-        layout: Layout | None = None,
-        name: str | None = None,
-        observation_key: str = "observation",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(layout, name, observation_key, **kwargs)
-        self.register_buffer("_half", torch.tensor(0.5), persistent=False)
-        self.register_buffer("_signs", torch.tensor([1.0, -1.0])[:, None, None], persistent=False)
 
     def constraint_set(self, tensordict: TensorDictBase) -> Box:
         """Return the box of allowed moves (docs/method.md, section 4)."""
@@ -151,18 +134,20 @@ class ObstacleGeometry(PointNavGeometry):
         distance = way.side_distances
         separates = way.separating.amax(1, keepdim=True) > 0
         eligible = torch.where(separates, way.separating, distance) - self.path.precedence
-        left_out = eligible != eligible.amax(1, keepdim=True)
-        # No room is left beside the chosen side of a rectangle that is touched.
-        free = distance.masked_fill(distance.amax(1, keepdim=True) <= 0, -torch.inf)
+        # No room is left beside a rectangle that is touched, and any beyond the other sides of it.
+        # By sums, as masks take many times as long.
+        free = torch.nn.functional.threshold(distance, 0.0, -2 * self.layout.wall)
+        free = torch.add(free, eligible.amax(1, keepdim=True) - eligible, alpha=1e30)
         # All sides of the arena count.
-        rooms = torch.cat([free.masked_fill(left_out, torch.inf), way.wall_distances])
+        rooms = torch.cat([free, way.wall_distances])
         # Of high bounds, then of low ones with their signs changed.
         room = ((rooms.amin(0) - MARGIN) / self.layout.step_length).view(2, 2, -1)
         bounds = room.clamp(-1, 1)
-        outwards = torch.where(room[:1] >= room[1:], _BEYOND + 0.5, -_BEYOND - 0.5)
-        outwards = torch.addcmul(self._half, self._signs, outwards)
+        above, below = room.unbind()
+        outwards = (above >= below) * (1 + 2 * _BEYOND) - _BEYOND
+        outwards = torch.stack([outwards, 1 - outwards])
         bounds = torch.where(bounds.sum(0) <= 0, outwards, bounds)
-        high, low = bounds.mT.reshape(2, *way.batch, 2).unbind()
+        high, low = bounds.mT.reshape(2, *way.batch, 2).contiguous().unbind()
         return Box(-low, high, validate_args=False)
 
 
@@ -214,9 +199,6 @@ class BatteryGeometry(PointNavGeometry):
     turning radius. The ball is huge when the battery is full, and closes in on the station as the
     battery empties.
 
-    Publishes a candidate safe action, too: towards the waypoint, 0.95 of a step or, near a corner
-    of the action bounds, somewhat more; not beyond it.
-
     Where no move keeps the constraint (the charge is at the threshold or below) the ball lies
     beyond the action bounds, in the direction of the waypoint. Where the station is out of reach,
     the ball misses the bounds as it is.
@@ -238,27 +220,14 @@ class BatteryGeometry(PointNavGeometry):
         center = (way.corner - position.reshape(-1, 2).mT) / step + 1e-18
 
         lost = battery <= self.layout.battery_threshold
-        # Radius 1, and sqrt(2) to the corner of the action bounds: from 2 + 2 on they do not meet.
-        length = center.square().sum(0).sqrt()
-        shares = (length / (_BEYOND + 2)).clamp(max=1).masked_fill(~lost, 1)
+        # Radius 1, and sqrt(2) to the corner of the action bounds: at 2 + 2 they do not meet.
+        beyond = (_BEYOND + 2) * center.square().sum(0).rsqrt()
+        center = center * torch.where(lost, beyond, torch.ones_like(beyond))
         return Ball(
-            (center / shares).mT.reshape(*way.batch, 2).contiguous(),
+            center.mT.reshape(*way.batch, 2).contiguous(),
             radius.masked_fill(lost, 1).view(way.batch),
             validate_args=False,
         )
-
-    def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor:
-        """Return the move towards the next waypoint, which is the ball's center.
-
-        Longer than usual where the ball only just reaches into a corner of the action bounds: to
-        where it is as far from the bounds, 1 - t max|u_i|, as from the ball's boundary,
-        r - (length - t).
-        """
-        center, radius = allowed.fields()["center"], allowed.fields()["radius"].unsqueeze(-1)
-        length = torch.linalg.vector_norm(center, dim=-1, keepdim=True)
-        far = length.clamp(min=SAFE_SPEED)
-        balanced = (1 + length - radius) / (far + center.abs().amax(-1, keepdim=True))
-        return center * torch.maximum(SAFE_SPEED / far, balanced).clamp(max=1)
 
 
 def read_observation(tensordict: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:

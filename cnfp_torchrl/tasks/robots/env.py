@@ -37,7 +37,8 @@ class RobotEnv(EnvBase):
         robot: The id of a Gymnasium environment of MuJoCo, such as ``HalfCheetah-v5``.
         batch_size: The shape of the batch of robots, which are independent of each other.
         judges: Judges of the constraints by their names.
-        observes_action: Append the motors' last action, 0 after a reset, to the observation.
+        observes_action: Whether the motors' last action, 0 after a reset, is appended to the
+            observation.
         max_steps: The length at which an episode is truncated; None takes Gymnasium's.
         seed: The seed of the starts; None takes one from torch's global generator.
 
