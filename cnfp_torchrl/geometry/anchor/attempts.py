@@ -174,7 +174,9 @@ def _roomiest(
             largest = rounding.squeeze(-1) if rounding.shape[-1] == 1 else rounding.amax(-1)
             beyond = torch.maximum(needed, EROSIONS * largest)
             room = torch.minimum(room, constraint_set.slack(stacked) - beyond)
-    room, best = room.nan_to_num(nan=-torch.inf).max(0, keepdim=True)
-    # Not take_along_dim, with which an exported program would be one for a single batch size.
-    index = best.unsqueeze(-1).expand(1, *shape, stacked.shape[-1])
-    return Attempt(stacked.gather(0, index).squeeze(0), upper, room.squeeze(0) >= 0)
+    # Not by `max` and its index, as gathering takes longer than choosing between two.
+    (most, *rooms), (anchor, *others) = room.nan_to_num(nan=-torch.inf).unbind(), stacked.unbind()
+    for each, point in zip(rooms, others, strict=True):
+        anchor = torch.where((each > most).unsqueeze(-1), point, anchor)
+        most = torch.maximum(most, each)
+    return Attempt(anchor, upper, most >= 0)

@@ -134,18 +134,20 @@ class ObstacleGeometry(PointNavGeometry):
         distance = way.side_distances
         separates = way.separating.amax(1, keepdim=True) > 0
         eligible = torch.where(separates, way.separating, distance) - self.path.precedence
-        left_out = eligible != eligible.amax(1, keepdim=True)
-        # No room is left beside the chosen side of a rectangle that is touched.
-        free = distance.masked_fill(distance.amax(1, keepdim=True) <= 0, -torch.inf)
+        # No room is left beside a rectangle that is touched, and any beyond the other sides of it.
+        # By sums, as masks take many times as long.
+        free = torch.nn.functional.threshold(distance, 0.0, -2 * self.layout.wall)
+        free = torch.add(free, eligible.amax(1, keepdim=True) - eligible, alpha=1e30)
         # All sides of the arena count.
-        rooms = torch.cat([free.masked_fill(left_out, torch.inf), way.wall_distances])
+        rooms = torch.cat([free, way.wall_distances])
         # Of high bounds, then of low ones with their signs changed.
         room = ((rooms.amin(0) - MARGIN) / self.layout.step_length).view(2, 2, -1)
         bounds = room.clamp(-1, 1)
-        outwards = torch.where(room[0] >= room[1], _BEYOND + 1, -_BEYOND)
+        above, below = room.unbind()
+        outwards = (above >= below) * (1 + 2 * _BEYOND) - _BEYOND
         outwards = torch.stack([outwards, 1 - outwards])
         bounds = torch.where(bounds.sum(0) <= 0, outwards, bounds)
-        high, low = bounds.mT.reshape(2, *way.batch, 2).unbind()
+        high, low = bounds.mT.reshape(2, *way.batch, 2).contiguous().unbind()
         return Box(-low, high, validate_args=False)
 
 
@@ -218,11 +220,11 @@ class BatteryGeometry(PointNavGeometry):
         center = (way.corner - position.reshape(-1, 2).mT) / step + 1e-18
 
         lost = battery <= self.layout.battery_threshold
-        # Radius 1, and sqrt(2) to the corner of the action bounds: from 2 + 2 on they do not meet.
-        length = center.square().sum(0).sqrt()
-        shares = (length / (_BEYOND + 2)).clamp(max=1).masked_fill(~lost, 1)
+        # Radius 1, and sqrt(2) to the corner of the action bounds: at 2 + 2 they do not meet.
+        beyond = (_BEYOND + 2) * center.square().sum(0).rsqrt()
+        center = center * torch.where(lost, beyond, torch.ones_like(beyond))
         return Ball(
-            (center / shares).mT.reshape(*way.batch, 2).contiguous(),
+            center.mT.reshape(*way.batch, 2).contiguous(),
             radius.masked_fill(lost, 1).view(way.batch),
             validate_args=False,
         )

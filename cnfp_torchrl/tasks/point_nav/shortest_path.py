@@ -119,8 +119,9 @@ class ShortestPath(nn.Module):
         at = position.reshape(-1, 2).mT.contiguous()
         distances = (self.sides + self.outwards * at).flatten(1, 2)
         node, lost = self._nearest_node(at, distances)
-        corner, beyond, clear = self.node_table.index_select(1, node).tensor_split((2, 4))
-        side_distances, wall_distances = distances.tensor_split((len(self.rectangles),))
+        count = len(self.rectangles)
+        corner, beyond, clear = self.node_table.index_select(1, node).split((2, 2, 4 * count))
+        side_distances, wall_distances = distances.split((count, 1))
         separating = side_distances + clear.view_as(side_distances)
         separating = separating.masked_fill(lost, -torch.inf)
         return StationWay(
@@ -132,7 +133,8 @@ class ShortestPath(nn.Module):
         """Return the numbers of the nodes to go to, and where none is seen, both ``(B,)``."""
         # The sides that a rectangle is seen from tell which nodes are separable from it: looked up,
         # not compared side by side with each node.
-        rows = ((distances[: len(self.first_rows)] > 0) * self.side_codes).sum(1)
+        seen_from = (distances[: len(self.first_rows)] > 0) * self.side_codes
+        rows = seen_from.sum(1, dtype=torch.int32)
         if len(rows) == 1:
             lengths = self.node_lengths.index_select(1, rows[0])
         else:
@@ -141,8 +143,9 @@ class ShortestPath(nn.Module):
             lengths = lengths.unflatten(1, rows.shape).amax(1)
         # In place, as most of the time of large batches is that of memory. Not `torch.hypot`, which
         # takes as long as all of this.
-        along = at[1] - self.node_y
-        distance = (at[0] - self.node_x).square_().addcmul_(along, along).sqrt_()
+        x, y = at.unbind()
+        along = y - self.node_y
+        distance = (x - self.node_x).square_().addcmul_(along, along).sqrt_()
         lengths = lengths.add_(distance)
         shortest = lengths.amin(0)
         # Not `min` with its index, nor `argmin`, which take some times as long: the least number of
@@ -207,6 +210,9 @@ class ShortestPath(nn.Module):
             shorter := torch.minimum(rest, (lengths + rest).amin(-1) + turn), rest
         ):
             rest = shorter
+        needed = is_station | _are_needed(nodes, rest, clear, rectangles, layout.wall)
+        nodes, is_station, clear = nodes[needed], is_station[needed], clear[needed]
+        rest, turning_radius, zero = rest[needed], turning_radius[needed], zero[needed]
         # The lengths from each node onwards, in sixteen columns for each rectangle: one for each
         # combination of sides that it is seen from. A station behind one is farther than anything
         # else, so that the nearest of them is gone to if all are hidden. The arena hides nothing.
@@ -252,6 +258,44 @@ class ShortestPath(nn.Module):
             through = lengths[:, middle, None] + lengths[middle, None, :]
             lengths = torch.minimum(lengths, through)
         return [("corners", corners), ("corner_lengths", lengths + turn)]
+
+
+def _are_needed(
+    nodes: Tensor, rest: Tensor, clear: Tensor, rectangles: Tensor, wall: float
+) -> Tensor:
+    """Tell which nodes may be the best from anywhere in the arena, bool ``(N,)``.
+
+    Prolonged sides of rectangles cut the arena into cells, in which all positions see the same
+    nodes. A node is the best nowhere in a cell that sees another one with a shorter way onwards: by
+    more than the distance of the two, or than what the cell's farthest corner from that one is
+    farther away than the cell is from this one.
+
+    Args:
+        nodes: The nodes, ``(N, 2)``.
+        rest: The lengths from them to the nearest station, ``(N,)``.
+        clear: Which sides of each rectangle they are clear of, bool ``(N, R, 4)``.
+        rectangles: The rectangles, ``(R, 4)``.
+        wall: The largest coordinate in the arena.
+    """
+    spans = []
+    for ends in (rectangles[:, 0::2], rectangles[:, 1::2]):
+        lines = torch.cat([ends.flatten(), ends.new_tensor([-wall, wall])])
+        lines = lines.clamp(-wall, wall).unique()
+        # On the lines themselves fewer nodes may be seen than on either side.
+        between = torch.stack([lines[:-1], lines[1:]], -1)
+        spans.append(torch.cat([between, torch.stack([lines, lines], -1)]))
+    index = torch.cartesian_prod(*(torch.arange(len(span)) for span in spans)).unbind(-1)
+    low, high = torch.stack([span[i] for span, i in zip(spans, index, strict=True)], 1).unbind(-1)
+    beyond = side_distances((low + high) / 2, rectangles) > 0
+    seen = (beyond.unsqueeze(1) & clear).any(-1).all(-1)
+    offsets = torch.stack([low.unsqueeze(1) - nodes, nodes - high.unsqueeze(1)])
+    nearest = torch.linalg.vector_norm(offsets.amax(0).clamp(min=0), dim=-1)
+    farthest = torch.linalg.vector_norm(offsets.amin(0), dim=-1)
+    needed = rest.isfinite()
+    for n, apart in enumerate(_lengths(nodes)):
+        beats = torch.minimum(apart, farthest - nearest[:, n : n + 1]) + rest < rest[n]
+        needed[n] &= (seen[:, n] & ~(beats & seen).any(-1)).any()
+    return needed
 
 
 def _lengths(points: Tensor) -> Tensor:

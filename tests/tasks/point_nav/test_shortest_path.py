@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv, ShortestPath
+from cnfp_torchrl.tasks.point_nav import Layout, PointNavEnv, ShortestPath, shortest_path
 from cnfp_torchrl.tasks.point_nav.indicators import segment_touches_rectangle
 from cnfp_torchrl.tasks.point_nav.shortest_path import visible
-from tests.layouts import MAZE, NONE
+from tests.layouts import MAZE, NONE, THREE
 
 
 def test_on_the_reference_layout_the_waypoint_is_the_nearest_station() -> None:
@@ -63,6 +63,26 @@ def test_the_way_to_a_goal_is_the_shortest() -> None:
     goal = torch.tensor([[0.5, 0.1], [0.5, -0.1], [0.5, 0.6], [0.5, 0.0]])
     expected = torch.tensor([[-0.32, 0.32], [-0.32, -0.32], [0.5, 0.6], [0.5, 0.0]])
     assert torch.allclose(path.to_goal(position, goal), expected)
+
+
+@pytest.mark.parametrize("layout", [Layout(), NONE, THREE, MAZE])
+def test_nodes_that_are_never_the_best_are_not_missed(
+    layout: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also on prolonged sides and in rectangles; the reference needs its four stations alone."""
+    position = torch.rand(20_000, 2) * 2 - 1
+    edges = torch.tensor([*layout.rectangles, (-1.0, -1.0, 1.0, 1.0)])
+    position[:5000, 0] = edges[torch.randint(len(edges), (5000,)), 2 * torch.randint(2, (5000,))]
+    position[2500:7500, 1] = edges[torch.randint(len(edges), (5000,)), 1]
+    path = ShortestPath(layout)
+    way = path.to_station(position)
+    monkeypatch.setattr(shortest_path, "_are_needed", lambda nodes, *_: nodes[:, 0] == nodes[:, 0])
+    whole = ShortestPath(layout)
+    expected = whole.to_station(position)
+    assert (len(path.node_x), len(whole.node_x)) == (4, 20) or layout != Layout()
+    assert torch.equal(way.found, expected.found)
+    assert torch.equal(way.waypoint, expected.waypoint)
+    assert torch.equal(way.rest, expected.rest)
 
 
 def test_any_batch_shape() -> None:
