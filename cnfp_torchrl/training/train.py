@@ -23,6 +23,7 @@ from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
     training_environment,
+    warn_of_large_observations,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -76,7 +77,7 @@ def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dic
     Raises:
         ValueError: before any work, for a setting that makes no sense.
         CheckpointError: when the state of the run cannot be written or read, or a log not written.
-        TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved.
+        TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved, or came twice.
     """
     with closing(folder), folder.naming_what_cannot_be_written():
         return _train(config, folder, resume)
@@ -99,6 +100,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     with starting_workers():  # such as those of a ParallelEnv
         env = training_environment(config)
         env.set_seed(config.seed)
+        warn_of_large_observations(config, env)
         tally = ConstraintTally.of(env)
         actor = build_actor(config, env)
         learner: Learner = instantiate(config.algorithm, _partial_=True)(
@@ -174,7 +176,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             best.offer_evaluation(report)
 
     with closing(callback), closing(evaluations):
-        with StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+        with StopRequest(folder.how_to_resume(), STOP_SIGNALS if is_saved else ()) as stop:
             with closing(metrics), shutting_down(collector):
                 for collected in collector:
                     callback.on_batch(collected)

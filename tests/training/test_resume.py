@@ -180,19 +180,20 @@ def test_a_signal_ends_the_evaluation_at_once(
 
 
 def test_a_second_signal_stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    with StopRequest() as stop:
+    with StopRequest("ended") as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.signal == signal.SIGTERM
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(TrainingInterrupted, match="ended") as raised:
             os.kill(os.getpid(), signal.SIGINT)
+        assert raised.value.number == signal.SIGINT
     clock = iter([100.0, 100.5, 101.5])
     monkeypatch.setattr(
         "cnfp_torchrl.training.interruption.time", SimpleNamespace(monotonic=clock.__next__)
     )
-    with StopRequest():
+    with StopRequest("ended"):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)  # the first once more, passed on by a sweep
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(TrainingInterrupted):
             os.kill(os.getpid(), signal.SIGINT)
 
 
