@@ -47,6 +47,7 @@ from cnfp_torchrl.modules.publisher import (
     publishes_constraints,
 )
 from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.scaled_network import ScaledNetwork
 
 __all__ = [
     "ActionBounds",
@@ -71,6 +72,7 @@ __all__ = [
     "RelaxedConstraintError",
     "SafeRandomLatents",
     "SafeRandomPolicy",
+    "ScaledNetwork",
     "SoftFlow",
     "SquashFlow",
     "UnconstrainedFlow",

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from cnfp_torchrl.modules import ScaledNetwork
+
 _ELEMENTWISE = (
     nn.CELU,
     nn.ELU,
@@ -36,6 +38,12 @@ class _Linear(NamedTuple):
     bias: str | None
 
 
+class _Scale(NamedTuple):
+    """The name of an input's scale among the stacked parameters."""
+
+    scale: str
+
+
 class StackedPerceptron:
     """Apply n networks of linear layers and elementwise activations that differ in weights alone.
 
@@ -43,10 +51,10 @@ class StackedPerceptron:
     matrix product.
 
     Args:
-        steps: The linear layers and activations in order.
+        steps: The scale of the inputs, linear layers and activations in order.
     """
 
-    def __init__(self, steps: Sequence[_Linear | Callable[[Tensor], Tensor]]) -> None:
+    def __init__(self, steps: Sequence[_Linear | _Scale | Callable[[Tensor], Tensor]]) -> None:
         self._steps = tuple(steps)
 
     @classmethod
@@ -59,12 +67,14 @@ class StackedPerceptron:
         """
         if type(network) is MLP and network._reshape_out:
             return None
-        steps: list[_Linear | Callable[[Tensor], Tensor]] = []
+        steps: list[_Linear | _Scale | Callable[[Tensor], Tensor]] = []
         for name, module in network.named_modules(remove_duplicate=False):
             if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
                 return None
-            if type(module) is nn.Linear:
-                prefix = f"{name}." if name else ""
+            prefix = f"{name}." if name else ""
+            if type(module) is ScaledNetwork:
+                steps.append(_Scale(f"{prefix}scale"))
+            elif type(module) is nn.Linear:
                 bias = None if module.bias is None else f"{prefix}bias"
                 steps.append(_Linear(f"{prefix}weight", bias))
             elif type(module) in _ELEMENTWISE:
@@ -85,6 +95,9 @@ class StackedPerceptron:
         # they nor their gradients are transposed. 15 to 20 % faster than the usual order.
         values = inputs.reshape(-1, inputs.shape[-1]).mT
         for step in self._steps:
+            if isinstance(step, _Scale):
+                values = values / weights[step.scale].unsqueeze(-1)
+                continue
             if not isinstance(step, _Linear):
                 values = step(values)
                 continue

@@ -23,6 +23,7 @@ from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
     training_environment,
+    warn_of_large_observations,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -99,6 +100,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
     with starting_workers():  # such as those of a ParallelEnv
         env = training_environment(config)
         env.set_seed(config.seed)
+        warn_of_large_observations(config, env)
         tally = ConstraintTally.of(env)
         actor = build_actor(config, env)
         learner: Learner = instantiate(config.algorithm, _partial_=True)(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cache, partial
 
@@ -550,3 +550,8 @@ def latents(case: Case, count: int, dtype: torch.dtype, length: float | None = N
     axis = torch.where(z.abs() == z.abs().amax(-1, keepdim=True), z, 0.0)
     z = torch.where(kind < 0.6, z, torch.where(kind < 0.8, z.sign(), axis))
     return (z / z.norm(dim=-1, keepdim=True) * length).to(dtype)
+
+
+def latents_of(case: Case, count: int, dtype: torch.dtype, lengths: Iterable[float]) -> Tensor:
+    """Return base samples of several lengths, ``(lengths * count, *batch, d)``."""
+    return torch.cat([latents(case, count, dtype, length) for length in lengths])

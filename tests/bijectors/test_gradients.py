@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cnfp_torchrl.bijectors import Bijector, GaugeSquash
 from cnfp_torchrl.geometry import Ball, Box, Region
-from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, tensor
+from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, latents_of, tensor
 from tests.bijectors.numeric import central_difference
 
 ids = {"ids": lambda case: case.name}
@@ -26,16 +26,16 @@ def gradients(bijector: Bijector, latent: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_gradients_are_finite(case: Case, dtype: torch.dtype) -> None:
-    bijector = case.build(dtype)
-    for length in (0.0, 1e-40, 1e-25, 1e-18, 1e-12, 1.0, 8.0, 20.0, 1e6, 1e15):
-        for gradient in gradients(bijector, latents(case, 20, dtype, length)):
-            assert gradient.isfinite().all(), f"at |z| = {length}"
+    lengths = (0.0, 1e-40, 1e-25, 1e-18, 1e-12, 1.0, 8.0, 20.0, 1e6, 1e15)
+    z = latents_of(case, 20, dtype, lengths)
+    for gradient in gradients(case.build(dtype), z):
+        assert z[~gradient.isfinite()].tolist() == []
 
 
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_gradients_equal_finite_differences(case: Case) -> None:
     bijector = case.build(torch.float64)
-    z = torch.cat([latents(case, 8, torch.float64, length) for length in (0.3, 1.0, 3.0)])
+    z = latents_of(case, 8, torch.float64, (0.3, 1.0, 3.0))
     # A step across a kink tells nothing; on the axes and diagonals of `latents` there are some.
     z = z + 0.01 * torch.randn_like(z)
     direction = torch.randn_like(z)

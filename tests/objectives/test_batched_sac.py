@@ -20,7 +20,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
-from cnfp_torchrl.modules import with_reference_entropy
+from cnfp_torchrl.modules import ScaledNetwork, with_reference_entropy
 from cnfp_torchrl.objectives import BatchedSACLoss
 from cnfp_torchrl.objectives.stacked_perceptron import StackedPerceptron
 from cnfp_torchrl.training.networks import action_cost_network, action_value_network
@@ -360,6 +360,7 @@ def test_the_caller_s_tensordict_gains_the_priority_alone(batch: TensorDictBase)
     [
         (nn.Linear(3, 2), 3),
         (nn.Linear(3, 2, bias=False), 3),
+        (ScaledNetwork([150.0, 0.1, 1.0], nn.Sequential(nn.Linear(3, 2), nn.Tanh())), 3),
         (nn.Sequential(nn.Linear(3, 4), nn.Sequential(nn.SiLU(), nn.Linear(4, 2, bias=False))), 3),
         (MLP(in_features=3, out_features=2, num_cells=[5, 4], activation_class=nn.ELU), 3),
         (action_cost_network(2, 1, 2, hidden=[4]).module, 3),
@@ -376,8 +377,8 @@ def test_stacked_networks_are_the_networks(
         for parameter in member.parameters():
             nn.init.normal_(parameter)
     weights = {
-        name: torch.stack([dict(member.named_parameters())[name] for member in members])
-        for name, _ in network.named_parameters()
+        name: torch.stack([member.state_dict(keep_vars=True)[name] for member in members])
+        for name in network.state_dict()
     }
     given = torch.randn(*batch, inputs, requires_grad=True)
     expected, mine = torch.stack([member(given) for member in members]), stacked(given, weights)

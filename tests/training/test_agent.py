@@ -10,7 +10,13 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase, GymEnv, ParallelEnv, StepCounter, TransformedEnv
 
 from cnfp_torchrl.configuration import compose_config
-from cnfp_torchrl.training.agent import build_environment, training_environment
+from cnfp_torchrl.training.agent import (
+    build_actor,
+    build_critic,
+    build_environment,
+    training_environment,
+    warn_of_large_observations,
+)
 
 
 def parallel(batch_size: list[int]) -> EnvBase:
@@ -57,3 +63,47 @@ def test_a_compiled_run_compiles_what_a_step_computes(
     env = training_environment(compose_config("env.agents=2", *overrides))
     assert env.rollout(3)["next", "reward"].isfinite().all()
     assert compiled == functions
+
+
+SCALE = [150.0, 90.0, 1.0, 0.01, 3.0]
+
+
+def test_networks_read_scaled_observations_and_geometries_do_not() -> None:
+    given = compose_config("env.agents=2", f"network.observation_scale={SCALE}")
+    env = training_environment(given)
+    state = env.rollout(2)
+    networks = {"actor": build_actor(given, env)[0], "critic": build_critic(given, env)}
+    given.network.observation_scale = None
+    plain = {"actor": build_actor(given, env)[0], "critic": build_critic(given, env)}
+    for name, network in networks.items():
+        weights = {key.replace("network.", "", 1): x for key, x in network.state_dict().items()}
+        plain[name].load_state_dict({k: x for k, x in weights.items() if not k.endswith("scale")})
+        scaled = state.clone()
+        scaled["observation"] = scaled["observation"] / torch.tensor(SCALE)
+        written, expected = network(state.clone()), plain[name](scaled)
+        for key in network.out_keys:
+            torch.testing.assert_close(written[key], expected[key])
+
+
+@pytest.mark.parametrize("scale", [[1.0], [1, 1, 1, 1, 0], [1, 1, 1, 1, -1.0], [1, 1, 1, 1, "x"]])
+def test_a_scale_that_does_not_fit_is_refused(scale: list[object]) -> None:
+    given = compose_config("env.agents=2")
+    given.network.observation_scale = scale
+    with pytest.raises(ValueError, match=r"^network\.observation_scale: .*the 5 components"):
+        build_actor(given, training_environment(given))
+
+
+def test_large_observations_are_warned_of_unless_they_are_scaled() -> None:
+    given = compose_config("env.agents=2")
+    env = training_environment(given)
+    warn_of_large_observations(given, env)  # those of point navigation are not large
+    env = TransformedEnv(GymEnv("MountainCarContinuous-v0"))
+    warn_of_large_observations(given, env)
+    warn_of_large_observations(given, TransformedEnv(GymEnv("CartPole-v1")))  # without ends
+    env = TransformedEnv(GymEnv("Acrobot-v1"))
+    with pytest.warns(
+        UserWarning, match=r"reach 28.3.*network\.observation_scale=\[1,1,1,1,13,28\]"
+    ):
+        warn_of_large_observations(given, env)
+    given.network.observation_scale = [1, 1, 1, 1, 13, 28]
+    warn_of_large_observations(given, env)

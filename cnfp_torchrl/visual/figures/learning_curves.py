@@ -114,7 +114,10 @@ def learning_curves(
         _draw_violations(axes[1], counted, colors)
         for panel, (heading, group) in zip(axes[2:], groups.items(), strict=False):
             panel.set_title(heading)
-            _draw_by_constraint(panel, group, colors, "{:.3g}")
+            if heading == headings[JUDGED]:
+                _draw_counts(panel, group, colors)
+            else:
+                _draw_by_constraint(panel, group, colors, "{:.3g}")
         for panel, (name, curve) in zip(axes[2 + len(groups) :], others.items(), strict=True):
             panel.set_title(_title(name))
             _plot(panel, curve)
@@ -130,7 +133,7 @@ def learning_curves(
 
 def _title(name: str) -> str:
     group, _, last = name.rpartition("/")
-    if group == "loss" and last != "entropy":
+    if group == "loss":
         return f"{_LOSSES.get(last, last)} loss"
     title = _TITLES.get(last, last.replace("_", " "))
     return f"{title} in an evaluation" if group == "evaluation" else title
@@ -153,6 +156,10 @@ def _draw_violations(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[s
     if not counted:
         say(axes, "none counted")
         return
+    _draw_counts(axes, counted, colors)
+
+
+def _draw_counts(axes: Axes, counted: Mapping[str, Curve], colors: Mapping[str, str]) -> None:
     _draw_by_constraint(axes, counted, colors, "{:,.0f}")
     highest = max(float(values.max()) for _, values in counted.values())
     axes.set_ylim(-0.04 * max(highest, 1), 1.05 * max(highest, 1))
