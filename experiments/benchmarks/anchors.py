@@ -241,16 +241,16 @@ def _norm_bound(matrix: Array) -> float:
 
 def largest_excess(
     fixed: Sequence[tuple[Rows, Array]],
-    trial: Sequence[tuple[Rows, Array]],
+    maximized: Sequence[tuple[Rows, Array]],
     bounds: Sequence[tuple[float, float]],
     start: Array,
     precision: float,
 ) -> tuple[float, float]:
-    """Return bounds of the largest t by which slacks of sets on trial exceed what is required.
+    """Return bounds of the largest t by which slacks of maximized sets exceed what is required.
 
     Args:
         fixed: Sets with the slacks that their rows must have.
-        trial: Sets with the slacks that their rows exceed by t.
+        maximized: Sets with the slacks that their rows exceed by t.
         bounds: The bounds of the actions.
         start: An action to begin at.
         precision: How close the bounds shall come.
@@ -261,7 +261,7 @@ def largest_excess(
         """Return all rooms, their gradients in (action, t), and how often t counts."""
         every = [
             (rows(a), needs, on)
-            for sets, on in ((fixed, 0.0), (trial, 1.0))
+            for sets, on in ((fixed, 0.0), (maximized, 1.0))
             for rows, needs in sets
         ]
         room = np.concatenate([slack - needs for (slack, _), needs, _ in every])
