@@ -201,17 +201,21 @@ def reference_chain(
     return flow
 
 
-def cast(each: ConstraintSet, dtype: torch.dtype) -> ConstraintSet:
-    return type(each)(**{name: value.to(dtype) for name, value in each.fields().items()})
+def cast(constraint_set: ConstraintSet, dtype: torch.dtype) -> ConstraintSet:
+    return type(constraint_set)(
+        **{name: value.to(dtype) for name, value in constraint_set.fields().items()}
+    )
 
 
-def element(each: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]) -> ConstraintSet:
+def element(
+    constraint_set: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]
+) -> ConstraintSet:
     """Return one set out of a batch."""
     values = {}
-    for name, value in each.fields().items():
-        event = value.shape[value.ndim - each.event_dims[name] :]
+    for name, value in constraint_set.fields().items():
+        event = value.shape[value.ndim - constraint_set.event_dims[name] :]
         values[name] = value.expand((*batch_shape, *event))[index]
-    return type(each)(**values)
+    return type(constraint_set)(**values)
 
 
 # Random sets around an anchor. All numbers are rounded to float32, so that both dtypes mean the

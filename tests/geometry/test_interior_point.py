@@ -128,8 +128,8 @@ def test_the_closed_form_is_what_newtons_method_finds() -> None:
     half = 0.3 + 0.5 * torch.rand(batch, dim).double()
     ball = Ball(2 * torch.randn(batch, dim).double(), 0.1 + torch.rand(batch).double())
     rows = HalfSpaces(torch.randn(batch, 2, dim).double(), torch.randn(batch, 2).double() - 1)
-    for each, count in ((ball, 1), (rows, 2)):
-        intersection = Intersection.of([Box(-ones, ones), Box(-half, 0.8 * half), each])
+    for constraint_set, count in ((ball, 1), (rows, 2)):
+        intersection = Intersection.of([Box(-ones, ones), Box(-half, 0.8 * half), constraint_set])
         counts = np.ones((batch, 4 * dim + count), dtype=bool)
         maximized = counts & (np.arange(4 * dim + count) >= 4 * dim)
         required = np.full(counts.shape, 1e-3)

@@ -64,12 +64,12 @@ def _best_over_box(problem: Program, start: Array) -> Best:
     for i, (cone, tip) in enumerate(zip(problem.cones, problem.tips, strict=True)):
         # Separable where the matrix is diagonal, as a ball's.
         slope, rest = cone[1:, :dim], cone[1:, :dim].copy()
-        each = np.arange(min(rest.shape[:2]))
-        rest[each, each] = 0
-        diagonal = slope[each, each]
-        wanted = np.where(diagonal == 0, near[each], tip[1 + each] / diagonal)
+        axes = np.arange(min(rest.shape[:2]))
+        rest[axes, axes] = 0
+        diagonal = slope[axes, axes]
+        wanted = np.where(diagonal == 0, near[axes], tip[1 + axes] / diagonal)
         nearest[i] = near
-        nearest[i, each] = np.clip(wanted, low[each], high[each])
+        nearest[i, axes] = np.clip(wanted, low[axes], high[axes])
         away = tip[1:] - (slope * nearest[i]).sum(1)
         separable = ~rest.any((0, 1))
         most.append(np.where(separable, tip[0] - np.sqrt(np.square(away).sum(0)), np.inf)[None])

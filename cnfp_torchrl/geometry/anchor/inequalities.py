@@ -141,7 +141,7 @@ class Inequalities:
             if (value := getattr(self, name)) is not None:
                 setattr(self, name, chosen(value, keep))
         self.cones = [_Cone(*(chosen(value, keep) for value in cone)) for cone in self.cones]
-        self.sums = [_Sum(*(chosen(value, keep) for value in each)) for each in self.sums]
+        self.sums = [_Sum(*(chosen(value, keep) for value in terms)) for terms in self.sums]
 
     def bound(self) -> Tensor:
         """Return upper bounds of the smallest slack, from each slack's own range, ``(B,)``."""

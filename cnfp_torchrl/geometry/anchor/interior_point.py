@@ -309,17 +309,17 @@ def _inverted(left: Array, right: Array) -> Array:
     step's.
     """
     matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
-    each = np.arange(matrix.shape[-1])
-    if len(each) > _SMALL:
+    axes = np.arange(matrix.shape[-1])
+    if len(axes) > _SMALL:
         # Rounding may have made a matrix singular.
-        matrix[:, each, each] *= 1 + 1e-14
+        matrix[:, axes, axes] *= 1 + 1e-14
         # Of problems that went on after they were settled, which no longer count.
-        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
+        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(axes))
         return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
     inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
-    least = 1e-15 * inverse[each, each]
+    least = 1e-15 * inverse[axes, axes]
     # The sweep operator (Goodnight 1979), which leaves the negative inverse.
-    for k in range(len(each)):
+    for k in range(len(axes)):
         # Where rounding made a matrix indefinite, t still grows along the direction.
         pivot = np.maximum(inverse[k, k], least[k])
         column = inverse[k].copy()
