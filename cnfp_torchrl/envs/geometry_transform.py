@@ -38,7 +38,7 @@ from cnfp_torchrl.modules import (
 
 
 class GeometryTransform(Transform, ConstraintPublisher):
-    """Publishes one constraint's set of allowed actions, as a function of the state.
+    """Publish one constraint's set of allowed actions, as a function of the state.
 
     A new constraint is one method::
 
@@ -490,7 +490,7 @@ class Check(NamedTuple):
     inputs: dict[NestedKey, Tensor]
     allowed: ConstraintSet
     refuse: Callable[[], None]
-    """Raises if a value is not as it must be."""
+    """Raise if a value is not as it must be."""
 
 
 def evidence(checks: Sequence[Check]) -> list[Evidence]:

@@ -174,7 +174,7 @@ def gauge_squash(
     return along(c, offset, share), log_det + len(latent) * mp.log(share)
 
 
-def aligned_squash(
+def exact_squash(
     sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:
     """Scale each component to the intersection of the boxes, then retract from there."""
