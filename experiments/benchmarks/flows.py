@@ -105,8 +105,8 @@ def radial_full_jacobian(p: Problem) -> Sample:
     count = len(p.balls)
 
     def one(latent: Tensor, anchor: Tensor, *fields: tuple[Tensor, Tensor]) -> Tensor:
-        balls = [Ball(*each, validate_args=False) for each in fields[:count]]
-        boxes = [Box(*each, validate_args=False) for each in fields[count:]]
+        balls = [Ball(*values, validate_args=False) for values in fields[:count]]
+        boxes = [Box(*values, validate_args=False) for values in fields[count:]]
         sets = (region.bounds, *balls, *boxes)
         return RadialSquash(Region(sets, anchor, validate_args=False))(latent)
 
@@ -149,7 +149,7 @@ def cvxpy_projection(p: Problem) -> Callable[[], Sample]:
     sides = [(cvxpy.Parameter(dim), cvxpy.Parameter(dim)) for _ in p.boxes]
     constraints = [action >= p.low.numpy(), action <= p.high.numpy()]
     constraints += [cvxpy.norm(action - m) <= r for m, r in zip(centers, radii, strict=True)]
-    constraints += [each for low, high in sides for each in (action >= low, action <= high)]
+    constraints += [row for low, high in sides for row in (action >= low, action <= high)]
     program = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(action - wish)), constraints)
     flat = [side for pair in sides for side in pair]
     layer = CvxpyLayer(program, parameters=[wish, *centers, *radii, *flat], variables=[action])

@@ -12,7 +12,7 @@ from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, latents_of
 from tests.bijectors.numeric import log_abs_det
 
 ids = {"ids": lambda case: case.name}
-RETRACTING = ("aligned", "gauge", "soft", "soft-rays")
+RETRACTING = ("exact", "gauge", "soft", "soft-rays")
 OTHERS = ("radial", "retraction", "soft-alone", "recession")
 INTERSECTING = [case for case in CASES if case.kind in (*RETRACTING, *OTHERS)]
 
@@ -102,25 +102,25 @@ def test_a_dropped_set_changes_nothing(kind: str) -> None:
 
 
 def test_a_box_leaves_the_motion_along_it_alone() -> None:
-    """What aligned and radial retractions differ in, and that they agree without boxes."""
+    """What exact and radial retractions differ in, and that they agree without boxes."""
     bounds, wall = (
         Box(tensor(-1.0, -1.0), tensor(1.0, 1.0)),
         Box(tensor(-2.0, -2.0), tensor(2.0, 0.1)),
     )
     far = tensor(20.0, 20.0)
-    aligned, radial = (
+    exact, radial = (
         Case("", kind, (bounds, wall), tensor(0.0, 0.0)).build(torch.float64)
-        for kind in ("aligned", "gauge")
+        for kind in ("exact", "gauge")
     )
-    torch.testing.assert_close(aligned(far), tensor(1.0, 0.1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(exact(far), tensor(1.0, 0.1), rtol=0, atol=1e-6)
     torch.testing.assert_close(radial(far), tensor(0.1, 0.1), rtol=0, atol=1e-6)
     ball = Ball(tensor(0.3, 0.0), tensor(0.9).squeeze())
-    aligned, radial = (
+    exact, radial = (
         Case("", kind, (bounds, ball), tensor(0.0, 0.0)).build(torch.float64)
-        for kind in ("aligned", "gauge")
+        for kind in ("exact", "gauge")
     )
     z = torch.randn(100, 2, dtype=torch.float64)
     for given, expected in zip(
-        aligned.forward_and_log_det(z), radial.forward_and_log_det(z), strict=True
+        exact.forward_and_log_det(z), radial.forward_and_log_det(z), strict=True
     ):
         torch.testing.assert_close(given, expected, rtol=0, atol=1e-14)

@@ -147,7 +147,7 @@ def test_a_killed_process_takes_no_run_with_it(tmp_path: Path) -> None:
     longer = ["collector.total_frames=960", "checkpoint.interval=48", "hydra.launcher.n_jobs=2"]
     process = begin_side_by_side(sweep, *longer, "seed=0,1,2")
     workers = psutil.Process(process.pid).children()
-    (killed,) = (each for each in workers if works_in(sweep / "0_seed-0", each))
+    (killed,) = (worker for worker in workers if works_in(sweep / "0_seed-0", worker))
     killed.kill()
     _, told = process.communicate()
     assert process.returncode == 0, told

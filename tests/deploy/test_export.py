@@ -132,7 +132,7 @@ def test_every_format(to: str, env: TransformedEnv, tmp_path: Path) -> None:
     policy = DeployedPolicy(actor, env, stochastic=True)
     export_policy(policy, tmp_path, to)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
-    assert [each["name"] for each in manifest["constraints"]] == ["battery", "obstacle"]
+    assert [constraint["name"] for constraint in manifest["constraints"]] == ["battery", "obstacle"]
     run = open_exported(tmp_path)
     states = observed_states(policy, env, actor, 100_000)
     found = self_test(policy, run, states)

@@ -154,13 +154,13 @@ def test_a_signal_stops_a_run_when_it_is_saved(
         if self.frames == 112:
             os.kill(os.getpid(), number)
 
-    handlers = [signal.getsignal(each) for each in STOP_SIGNALS]
+    handlers = [signal.getsignal(number) for number in STOP_SIGNALS]
     with monkeypatch.context() as patch:
         patch.setattr(Metrics, "add_steps", counting)
         with pytest.raises(TrainingInterrupted, match="step 112") as stopped:
             train(compose_config(*TINY), folder)
     assert f"resume={tmp_path / 'stopped'}" in str(stopped.value)
-    assert handlers == [signal.getsignal(each) for each in STOP_SIGNALS]
+    assert handlers == [signal.getsignal(number) for number in STOP_SIGNALS]
     go_on(folder.path)
     assert not differences(whole, folder.path)
 

@@ -183,7 +183,7 @@ def _roomiest(
             room = torch.minimum(room, constraint_set.slack(stacked) - beyond)
     # Not by `max` and its index, as gathering takes longer than choosing between two.
     (most, *rooms), (anchor, *others) = room.nan_to_num(nan=-torch.inf).unbind(), stacked.unbind()
-    for each, point in zip(rooms, others, strict=True):
-        anchor = torch.where((each > most).unsqueeze(-1), point, anchor)
-        most = torch.maximum(most, each)
+    for room, point in zip(rooms, others, strict=True):
+        anchor = torch.where((room > most).unsqueeze(-1), point, anchor)
+        most = torch.maximum(most, room)
     return Attempt(anchor, upper, most >= 0)

@@ -384,7 +384,7 @@ def test_a_window_shows_the_recording_and_stays(
 
     def last() -> list[int]:
         state = ViewerClient.connect(url(number)).get_state()
-        return [t.end for each in state.recordings for t in each.timelines]
+        return [t.end for recording in state.recordings for t in recording.timelines]
 
     try:
         # More than a portion, so that some of it is shown before the end.

@@ -43,7 +43,7 @@ def test_any_flow_in_any_action_space(
         view = f"/stages/{number}\\ {name}" + ("/a1\\,\\ a2" if dim > 2 else "")
         samples = read(path, f"{view}/samples", "Points2D:positions")
         outside = read(path, f"{view}/samples_outside", "Points2D:positions")
-        assert sum(len(each.get(0, [])) for each in (samples, outside)) == 64
+        assert sum(len(part.get(0, [])) for part in (samples, outside)) == 64
     executed = read(path, f"{view}/executed", "Points2D:positions")
     shown = min(dim, 2)
     for step, transition in enumerate((first_step, second_step)):
