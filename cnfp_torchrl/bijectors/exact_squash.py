@@ -177,7 +177,8 @@ class _Retraction:
             offset = offset * contraction.unsqueeze(-1)
             log_det = offset.shape[-1] * contraction.log()
         if factors is not None:
-            log_det = log_det - factors.log().sum(-1)
+            # In the dtype of latents, which may be finer than that of the sets.
+            log_det = log_det - factors.log().sum(-1, dtype=offset.dtype)
         return offset, log_det
 
     def _scaled_and_contraction(
