@@ -91,7 +91,8 @@ def test_in_the_workers_of_a_batched_environment(batch_size: tuple[int, ...]) ->
 
 
 def test_on_the_gymnasium_environment() -> None:
-    env = constrained(base=GymEnv(POINT_NAV_ID)).append_transform(ActionGuard())
+    base = GymEnv(POINT_NAV_ID, max_episode_steps=17)
+    env = constrained(base=base).append_transform(ActionGuard())
     env.auto_register_info_dict()
     env.set_seed(0)
     assert_guards(env, untrained_actor(env))
