@@ -4,8 +4,6 @@ import json
 import os
 import pickle
 import resource
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +21,7 @@ from cnfp_torchrl.training.checkpoints import CheckpointError
 from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, CONFIG, SUMMARY, RunFolder
 from cnfp_torchrl.visual.figures.canvas import save_png
 from cnfp_torchrl.whole_file import whole_file
+from tests.entry_points import call_command
 from tests.payload import Payload
 
 
@@ -55,20 +54,15 @@ def test_where_folders_cannot_be_locked_the_first_configuration_decides(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == [CONFIG]
 
 
-def test_a_command_leaves_the_folder_of_a_running_run_as_it_is(tmp_path: Path) -> None:
+def test_a_command_leaves_the_folder_of_a_running_run_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first = RunFolder.create(tmp_path / "run")
     (first.path / ".hydra").mkdir()
     (first.path / ".hydra" / "overrides.yaml").write_text("- of the first")
-    done = subprocess.run(
-        [Path(sys.executable).parent / "cnfp-train", f"hydra.run.dir={first.path}", "seed=3"],
-        cwd=tmp_path,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode != 0
-    assert f"another run works in {first.path}" in done.stderr
+    # A folder is held by who opened it, even against the process itself.
+    assert call_command("cnfp-train", f"hydra.run.dir={first.path}", "seed=3") != 0
+    assert f"another run works in {first.path}" in capsys.readouterr().err
     left = {path.name for path in first.path.rglob("*") if path.is_file() and path.stat().st_size}
     assert left == {"overrides.yaml"}
     assert (first.path / ".hydra" / "overrides.yaml").read_text() == "- of the first"
