@@ -10,9 +10,9 @@ from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.train import train
 
 TINY = [
-    "collector.total_frames=64",
-    "training.warmup_frames=32",
-    "training.update_ratio=0.05",
+    "collector.total_frames=32",
+    "training.warmup_frames=16",
+    "training.update_ratio=0.1",
     "evaluation.episodes=2",
     "+env.base.max_steps=5",
     "collector.frames_per_batch=16",
@@ -40,7 +40,7 @@ def test_every_option_runs(option: str, tmp_path: Path, monkeypatch: pytest.Monk
     group, _, name = option.rpartition("/")
     config = compose_config("figures=none", f"{group}={name}", *TINY)
     summary = train(config, RunFolder.create(tmp_path / "run"))
-    assert summary["steps"] == 64
+    assert summary["steps"] == 32
 
 
 @pytest.mark.parametrize("name", ["train", "evaluate", "audit"])

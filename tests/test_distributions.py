@@ -20,7 +20,7 @@ from cnfp_torchrl.bijectors import GaugeSquash
 from cnfp_torchrl.distributions import ConstrainedFlow, ReferenceEntropyFlow
 from cnfp_torchrl.geometry import Ball, Box, HalfSpaces, Region
 from tests.bijectors import reference
-from tests.bijectors.cases import BY_NAME, CASES, DTYPES, PLANE, Case, cast, latents, tensor
+from tests.bijectors.cases import BY_NAME, CASES, DTYPES, PLANE, Case, cast, tensor
 
 ids = {"ids": lambda case: case.name}
 LINE = [case for case in CASES if case.dim == 1 and not case.batch_shape and not case.saturates]
@@ -172,20 +172,6 @@ def test_log_prob_outside_is_minus_infinity(case: Case) -> None:
         assert not distribution.support.check(action).any()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("case", CASES, **ids)
-def test_log_prob_is_never_nan_on_the_boundary(case: Case, dtype: torch.dtype) -> None:
-    """Of saturated samples, and of their neighbors on either side of the boundary."""
-    distribution = flow(case, dtype)
-    z = torch.cat([latents(case, 50, dtype, length) for length in (5.0, 8.0, 12.0, 20.0, 1e6)])
-    action = distribution.bijector(z)
-    up = torch.nextafter(action, torch.full_like(action, torch.inf))
-    down = torch.nextafter(action, torch.full_like(action, -torch.inf))
-    log_prob = distribution.log_prob(torch.stack([action, up, down]))
-    assert not log_prob.isnan().any()
-    assert (log_prob < torch.inf).all()
-
-
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_nan_has_no_density(case: Case) -> None:
     distribution = flow(case, torch.float32)
@@ -325,12 +311,12 @@ def test_reference_flow_of_squashes_is_the_flow(case: Case) -> None:
 
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_deterministic_actions_are_allowed(case: Case) -> None:
-    for loc in (0.0, 0.7, -50.0, 1e6):
-        z = torch.full((*case.batch_shape, case.dim), loc)
-        distribution = ConstrainedFlow(gaussian(z, torch.ones_like(z)), case.build(torch.float32))
-        for action in (distribution.deterministic_sample, distribution.mode, distribution.mean):
-            assert case.allows(action).all()
-            torch.testing.assert_close(action, distribution.bijector(z), rtol=0, atol=0)
+    one = torch.ones(*case.batch_shape, case.dim)
+    z = torch.stack([loc * one for loc in (0.0, 0.7, -50.0, 1e6)])
+    distribution = ConstrainedFlow(gaussian(z, torch.ones_like(z)), case.build(torch.float32))
+    for action in (distribution.deterministic_sample, distribution.mode, distribution.mean):
+        assert case.allows(action).all()
+        torch.testing.assert_close(action, distribution.bijector(z), rtol=0, atol=0)
 
 
 def test_scores_keep_the_gradients_that_losses_need() -> None:
@@ -492,8 +478,9 @@ def scored_jointly(distribution: ConstrainedFlow, draw: str) -> tuple[Tensor, Te
     return getattr(distribution, draw)((30,)), log_prob
 
 
-@pytest.mark.parametrize("draw", ["sample", "rsample"])
-@pytest.mark.parametrize("scale", [0.3, 5.0, 100.0])
+@pytest.mark.parametrize(
+    ("draw", "scale"), [("sample", 0.3), ("rsample", 5.0), ("sample", 100.0), ("rsample", 100.0)]
+)
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_own_samples_have_the_density_of_their_draw(case: Case, scale: float, draw: str) -> None:
     distribution = flow(case, torch.float32, scale)

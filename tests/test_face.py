@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import cnfp_torchrl
@@ -25,11 +26,13 @@ OF_EXTRAS = {
 DEPENDENCIES = "gymnasium, numpy, tensordict.nn, torch, torchrl.data, torchrl.envs, torchrl.modules"
 
 
-def imported(statement: str) -> set[str]:
-    """Return the packages that a fresh process has after our dependencies and a statement."""
-    code = f"import sys, {DEPENDENCIES}\n{statement}\nprint(*sys.modules)"
+def imported(*statements: str) -> list[set[str]]:
+    """Return the packages that each of some statements brings into a fresh process, in turn."""
+    told = "print(*sys.modules)\n"
+    code = f"import sys, {DEPENDENCIES}\n{told}" + "".join(f"{s}\n{told}" for s in statements)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return {name.partition(".")[0] for name in done.stdout.split()}
+    packages = [{n.partition(".")[0] for n in names.split()} for names in done.stdout.splitlines()]
+    return [after - before for before, after in pairwise(packages)]
 
 
 def test_the_face_has_what_most_users_need_and_nothing_else() -> None:
@@ -48,11 +51,20 @@ def test_the_face_has_what_most_users_need_and_nothing_else() -> None:
         assert getattr(cnfp_torchrl, name).__doc__, name
 
 
-def test_the_core_brings_in_no_package_of_an_extra() -> None:
+def test_rooms_bring_in_no_package_that_they_do_not_use() -> None:
     rooms = ", ".join(f"cnfp_torchrl.{room}" for room in CORE)
-    task = "from cnfp_torchrl.tasks.point_nav import PointNavEnv, BatteryGeometry"
-    brought = imported(f"import cnfp_torchrl, {rooms}\n{task}") - imported("")
-    assert not brought & OF_EXTRAS
+    of_core, of_task, _, of_visual, of_rerun = imported(
+        f"import cnfp_torchrl, {rooms}",
+        "from cnfp_torchrl.tasks.point_nav import PointNavEnv, BatteryGeometry",
+        # Where Ray is installed TorchRL imports it, and with it psutil and pyarrow.
+        "import torchrl.collectors",
+        "import cnfp_torchrl.visual",
+        "import cnfp_torchrl.visual.rerun",
+    )
+    assert not (of_core | of_task) & OF_EXTRAS
+    assert not of_visual & {"rerun", "matplotlib", "hydra", "psutil", "pyarrow"}
+    assert "rerun" in of_rerun
+    assert not of_rerun & {"matplotlib", "hydra", "omegaconf"}
 
 
 def test_no_file_imports_private_names() -> None:

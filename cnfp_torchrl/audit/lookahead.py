@@ -29,7 +29,7 @@ class Outcome(NamedTuple):
 
 
 class StepReader:
-    """Reads indicators and active flags off a step.
+    """Read indicators and active flags off a step.
 
     Args:
         env: The environment.
@@ -95,7 +95,7 @@ class Lookahead(ABC):
 
 
 class StateSetterLookahead(Lookahead):
-    """Puts the environment into each state again, as many at once as its batch holds.
+    """Put the environment into each state again, as many at once as its batch holds.
 
     Args:
         env: The environment.
@@ -135,7 +135,7 @@ class StateSetterLookahead(Lookahead):
 
 
 class CopyLookahead(Lookahead):
-    """Steps copies of the environment that were made while it stood in the states.
+    """Step copies of the environment that were made while it stood in the states.
 
     Args:
         copies: Environments with their current states, of the environment's batch size.

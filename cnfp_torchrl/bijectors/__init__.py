@@ -2,10 +2,10 @@
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, has_latent
 from cnfp_torchrl.bijectors.chain import SquashChain
+from cnfp_torchrl.bijectors.exact_squash import ExactSquash, GaugeSquash
 from cnfp_torchrl.bijectors.projection import NoDensityError, Projection
 from cnfp_torchrl.bijectors.radial_squash import RadialSquash
 from cnfp_torchrl.bijectors.recession import Recession, require_scale
-from cnfp_torchrl.bijectors.region_squash import ExactSquash, GaugeSquash
 from cnfp_torchrl.bijectors.retraction import Retraction
 from cnfp_torchrl.bijectors.shell_squash import ShellSquash
 from cnfp_torchrl.bijectors.soft_retraction import (

@@ -179,9 +179,9 @@ class Recession(Bijector):
         """Return the rows of the half-spaces among the first sets."""
         sets = self._given.widened()
         chosen = [
-            (each, self._given.counts(stage))
-            for stage, each in enumerate(sets[:count])
-            if isinstance(each, HalfSpaces)
+            (constraint_set, self._given.counts(stage))
+            for stage, constraint_set in enumerate(sets[:count])
+            if isinstance(constraint_set, HalfSpaces)
         ]
         if not chosen:
             return None

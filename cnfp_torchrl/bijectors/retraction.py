@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector
-from cnfp_torchrl.bijectors.region_squash import contraction_along_rays
+from cnfp_torchrl.bijectors.exact_squash import contraction_along_rays
 from cnfp_torchrl.geometry import Box, ConstraintSet, broadcast_shape
 
 

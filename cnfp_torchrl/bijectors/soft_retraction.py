@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.bijectors.bijector import Bijector, Stages, stacked
-from cnfp_torchrl.bijectors.region_squash import ExactSquash, split
+from cnfp_torchrl.bijectors.exact_squash import ExactSquash, split
 from cnfp_torchrl.geometry import (
     Box,
     ConstraintSet,

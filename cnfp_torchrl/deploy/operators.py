@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 
 
 class OperatorsOfOnnx(TorchFunctionMode):
-    """Replaces operators that ONNX lacks, in its context."""
+    """Replace operators that ONNX lacks, in its context."""
 
     def __torch_function__(
         self,

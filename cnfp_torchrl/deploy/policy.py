@@ -104,7 +104,7 @@ class DeployedPolicy(nn.Module):
 
     @property
     def input_keys(self) -> list[NestedKey]:
-        """The keys of what is observed: of a vector that `CatTensors` makes, its parts."""
+        """The keys of what is observed; a vector that `CatTensors` makes is read by its parts."""
         return list(self.inputs)
 
     def examples(self, batch: int) -> tuple[Tensor, ...]:

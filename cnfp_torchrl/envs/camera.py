@@ -16,7 +16,7 @@ from cnfp_torchrl.keys import PIXELS_KEY
 
 
 class Camera:
-    """Takes pictures of an environment that has a method ``render``, of the first in a batch.
+    """Take pictures of an environment that has a method ``render``, of the first in a batch.
 
     An environment of Gymnasium may have been made without a ``render_mode``: it is asked for an
     array all the same. One that cannot render is warned of once, and shows nothing.

@@ -21,7 +21,7 @@ Indicator = Callable[[TensorDictBase, TensorDictBase], Tensor]
 
 
 class ConstraintCost(Transform):
-    """Writes indicators of violations at ``cost``, and their sum so far at ``episode_cost``.
+    """Write indicators of violations at ``cost``, and their sum so far at ``episode_cost``.
 
     Both are float32 ``(*batch, K)``, one column for each name of `constraint_names`, and zero after
     a reset. ``cost`` under ``next`` is the cost of the action beside it.

@@ -38,7 +38,7 @@ from cnfp_torchrl.modules import (
 
 
 class GeometryTransform(Transform, ConstraintPublisher):
-    """Publishes one constraint's set of allowed actions, as a function of the state.
+    """Publish one constraint's set of allowed actions, as a function of the state.
 
     A new constraint is one method::
 
@@ -279,8 +279,8 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if self.validate:
             check = self.check(next_tensordict, allowed)
             found = evidence([check])
-            values = torch.stack([each.value for each in found]).tolist() if found else []
-            if not are_within(values, (each.limit for each in found)):
+            values = torch.stack([evidence.value for evidence in found]).tolist() if found else []
+            if not are_within(values, (evidence.limit for evidence in found)):
                 refuse_values([check])
         if not self._is_compared and next_tensordict.numel() > 1:
             self._refuse_what_follows_the_batch(next_tensordict, allowed)
@@ -490,7 +490,7 @@ class Check(NamedTuple):
     inputs: dict[NestedKey, Tensor]
     allowed: ConstraintSet
     refuse: Callable[[], None]
-    """Raises if a value is not as it must be."""
+    """Raise if a value is not as it must be."""
 
 
 def evidence(checks: Sequence[Check]) -> list[Evidence]:
@@ -502,12 +502,12 @@ def evidence(checks: Sequence[Check]) -> list[Evidence]:
     # What several constraints read is looked at once.
     inputs = {key: value for check in checks for key, value in check.inputs.items()}
     found = [
-        each
+        evidence
         for value in inputs.values()
         if value.is_floating_point()
-        for each in extremes(value, torch.finfo(value.dtype).max)
+        for evidence in extremes(value, torch.finfo(value.dtype).max)
     ]
-    return found + [each for check in checks for each in check.allowed.evidence()]
+    return found + [evidence for check in checks for evidence in check.allowed.evidence()]
 
 
 def refuse_values(checks: Sequence[Check]) -> NoReturn:

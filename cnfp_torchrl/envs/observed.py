@@ -48,7 +48,7 @@ class ObservedEntry:
             return {self.key: value}
         pieces = value.split([part.spec.shape[-1] for part in self.parts], -1)
         split = [part.split(piece) for part, piece in zip(self.parts, pieces, strict=True)]
-        return {key: observed for each in split for key, observed in each.items()}
+        return {key: observed for part in split for key, observed in part.items()}
 
 
 def observed_entries(env: EnvBase, keys: Iterable[NestedKey]) -> list[ObservedEntry]:
@@ -69,10 +69,10 @@ def _entry(
     source = env if end == len(transforms) else transforms[end].parent
     whole = source.observation_spec[key]
     spec = whole[(0,) * len(env.batch_size)]
-    writers = [i for i, each in enumerate(transforms[:end]) if key in each.out_keys]
+    writers = [i for i, transform in enumerate(transforms[:end]) if key in transform.out_keys]
     if not writers or not isinstance(last := transforms[writers[-1]], CatTensors):
         return ObservedEntry(key, spec)
-    later = {k for each in transforms[writers[-1] + 1 :] for k in each.out_keys}
+    later = {k for transform in transforms[writers[-1] + 1 :] for k in transform.out_keys}
     if last.dim != -1 or later.intersection(last.in_keys):  # then a key does not say which value
         return ObservedEntry(key, spec)
     parts = (_entry(env, transforms, writers[-1], part) for part in last.in_keys)

@@ -73,7 +73,7 @@ class _Ring:
 
 
 class PackedStates(Transform):
-    """Keeps entries of states outside of a replay buffer's storage, each state once.
+    """Keep entries of states outside of a replay buffer's storage, each state once.
 
     The next state of a transition is the root of the following one, unless the episode has ended.
     A transition therefore stores two pointers (`POINTER_BYTES`) into a ring of states, in which all

@@ -13,7 +13,7 @@ from cnfp_torchrl.keys import COST_KEY, RAW_REWARD_KEY, REWARD_KEY
 
 
 class RewardPenalty(Transform):
-    r"""Replaces the reward by a constant whenever a constraint is violated.
+    r"""Replace the reward by a constant whenever a constraint is violated.
 
     .. math:: r' = -p \text{ if } \max_k c_k > 0, \text{ else } r
 

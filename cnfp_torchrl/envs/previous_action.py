@@ -13,7 +13,7 @@ from cnfp_torchrl.keys import PREVIOUS_ACTION_KEY
 
 
 class PreviousAction(Transform):
-    """Publishes in every state the action that led to it, for limits of how fast actions change.
+    """Publish in every state the action that led to it, for limits of how fast actions change.
 
     A geometry reads it like any other entry of a state::
 

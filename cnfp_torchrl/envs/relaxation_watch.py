@@ -22,7 +22,7 @@ class RelaxedEverywhereWarning(UserWarning):
 
 
 class RelaxationWatch:
-    """Warns, once, of constraints that gave way in each state of a larger batch.
+    """Warn, once, of constraints that gave way in each state of a larger batch.
 
     Giving way counts beyond what a set without interior needs
     (`cnfp_torchrl.geometry.relaxation_floor`): an equality always does that much.

@@ -17,7 +17,7 @@ from cnfp_torchrl.modules import appended_transforms, constraint_bijectors
 
 
 class SampledGeometry(Transform):
-    """Computes constraints' sets in a replay buffer, at the root and under ``next`` in one pass.
+    """Compute constraints' sets in a replay buffer, at the root and under ``next`` in one pass.
 
     The environment published the same sets in the same states, and checked them: nothing is checked
     again, so that on a GPU nothing waits. Anchor and flags are not computed here, but to be stored.

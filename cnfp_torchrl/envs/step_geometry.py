@@ -172,8 +172,8 @@ def _those_that_may_change(guards: Sequence[Any]) -> list[bool]:
 def _flags(begun: Begun, checks: Sequence[Check]) -> tuple[Tensor, list[float]]:
     """Return whether all states are decided, and numbers with limits that tell of the values."""
     found = evidence(checks)
-    flags = torch.stack([begun.attempt.decided.all(), *(each.value for each in found)])
-    return flags, [each.limit for each in found]
+    flags = torch.stack([begun.attempt.decided.all(), *(evidence.value for evidence in found)])
+    return flags, [evidence.limit for evidence in found]
 
 
 def anchor_entries(

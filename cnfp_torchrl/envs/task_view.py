@@ -215,7 +215,7 @@ NOTHING: TaskView = TaskView()
 
 
 class ShowTask(Transform):
-    """Gives a view to an environment whose class has none; changes nothing else.
+    """Give a view to an environment whose class has none; change nothing else.
 
     Args:
         view: The view.

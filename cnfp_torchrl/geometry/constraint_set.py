@@ -300,8 +300,10 @@ class ConstraintSet(ABC):
     @property
     def dim(self) -> int:
         """The dimension d of the action space."""
-        name = next(name for name, dims in self.event_dims.items() if dims > 0)
-        return int(getattr(self, name).shape[-1])
+        for name, dims in self.event_dims.items():
+            if dims > 0:
+                return int(getattr(self, name).shape[-1])
+        raise GeometryError(f"{type(self).__name__}: expected a field with event dimensions")
 
     @property
     def dtype(self) -> torch.dtype:

@@ -222,11 +222,11 @@ class VisibleRegion(ConstraintSet):
         order = torch.where(valid.gather(-1, order), order, best.unsqueeze(-1))
         ranked = torch.where(valid.sum(-1) > 1, largest, torch.inf).argsort(-1)
         parts = best.expand(most, most, *best.shape).clone()
-        for place in range(min(2, ranked.shape[-1])):
-            rectangle = ranked[..., [place]]
+        for axis in range(min(2, ranked.shape[-1])):
+            rectangle = ranked[..., [axis]]
             row = rectangle.unsqueeze(-1).expand(*rectangle.shape, order.shape[-1])
             options = order.gather(-2, row).movedim(-1, 0)
-            options = options.unsqueeze(place).expand(*parts.shape[:-1], 1)
+            options = options.unsqueeze(axis).expand(*parts.shape[:-1], 1)
             parts = parts.scatter(-1, rectangle.expand_as(options), options)
         return _chosen(normals, offsets, valid, parts.flatten(0, 1))
 

@@ -46,8 +46,9 @@ from cnfp_torchrl.modules.publisher import (
     constraint_bijectors,
     publishes_constraints,
 )
-from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy, WarmUpPolicy
+from cnfp_torchrl.modules.random_policy import SafeRandomLatents, SafeRandomPolicy
 from cnfp_torchrl.modules.scaled_network import ScaledNetwork
+from cnfp_torchrl.modules.warm_up import WarmUpPolicy
 
 __all__ = [
     "ActionBounds",

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 
 class ScaledNetwork(nn.Module):
-    """Puts inputs side by side, divides each component by a constant, and calls a network.
+    """Put inputs side by side, divide each component by a constant, and call a network.
 
     For inputs that are angles in degrees, pressures in pascal or the like. A network learns from
     numbers of some hundreds badly: its outputs, and the effect of a step of its weights, are as

@@ -49,7 +49,7 @@ class TrainingCallback(EpisodeCallback, Protocol):
 
 
 class CallbackFactory(Protocol):
-    """Makes the callbacks of a run: what ``conf/visual/`` describes.
+    """Make the callbacks of a run: what ``conf/visual/`` describes.
 
     Args:
         episodes: The number of episodes that callbacks get.
@@ -76,7 +76,7 @@ class CallbackFactory(Protocol):
 
 
 class NoCallback:
-    """Does nothing."""
+    """Do nothing."""
 
     loggers: Sequence[Logger] = ()
 

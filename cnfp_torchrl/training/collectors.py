@@ -97,7 +97,7 @@ class WorkerPolicy(TensorDictModuleBase):
 
 
 class WorkerCollector(ABC):
-    """Collects in workers, tells them the weights after each batch, and counts for all of them.
+    """Collect in workers, tell them the weights after each batch, and count for all of them.
 
     Workers start when it is iterated over. A resumed run goes on with the counts, and with new
     episodes.

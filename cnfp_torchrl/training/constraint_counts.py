@@ -81,7 +81,7 @@ def _sum(first: Mapping[str, int], second: Mapping[str, int]) -> dict[str, int]:
 
 
 class ConstraintTally:
-    """Counts steps and violations of each constraint, on the device until `counts` is called.
+    """Count steps and violations of each constraint, on the device until `counts` is called.
 
     Args:
         judged: The names of the columns of ``cost``.

@@ -35,7 +35,7 @@ def starting_workers() -> Iterator[None]:
 
 
 class TrainingInterrupted(BaseException):
-    """A run was asked to stop, and has saved its state.
+    """A run was asked to stop.
 
     No `Exception`, which Hydra would take for a failure and go on with the next run of a sweep.
 
@@ -53,7 +53,7 @@ class TrainingInterrupted(BaseException):
 
 
 class StopRequest:
-    """Remembers SIGTERM and Ctrl-C while it is entered; a second one ends the program at once.
+    """Remembers SIGTERM and Ctrl-C while it is entered; a second one ends the run at once.
 
     The same one within a second is no second one: a sweep passes on what a terminal or Slurm may
     have told its runs already.
@@ -61,11 +61,12 @@ class StopRequest:
     Outside of the main thread, where Python takes no signals, nothing is changed.
 
     Args:
+        at_once: Sentence that says how to go on after a second one.
         signals: Numbers of the signals; none changes nothing.
     """
 
-    def __init__(self, signals: Sequence[int] = STOP_SIGNALS) -> None:
-        self._signals = signals
+    def __init__(self, at_once: str, signals: Sequence[int] = STOP_SIGNALS) -> None:
+        self._at_once, self._signals = at_once, signals
         self.signal: int | None = None
         """The number of the signal that came, or None."""
         self._came = 0.0
@@ -106,7 +107,7 @@ class StopRequest:
         if self.signal == number and now - self._came < 1:
             return
         if self.signal is not None:
-            raise KeyboardInterrupt
+            raise TrainingInterrupted(number, self._at_once)
         self.signal, self._came = number, now
         name = signal.Signals(number).name
         sys.stderr.write(f"\n{name}: the run stops after this step and saves; again: at once\n")

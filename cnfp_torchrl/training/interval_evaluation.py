@@ -15,7 +15,7 @@ from cnfp_torchrl.training.settings import EvaluationSettings
 
 
 class IntervalEvaluation:
-    """Evaluates the stochastic policy every so many steps of training, in the same episodes.
+    """Evaluate the stochastic policy every so many steps of training, in the same episodes.
 
     It has an environment and random numbers of its own, so that training goes the same way with and
     without it.

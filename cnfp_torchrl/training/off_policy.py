@@ -23,7 +23,7 @@ from cnfp_torchrl.training.update import Update, UpdateBudget
 
 
 class OffPolicyLearner:
-    """Stores all transitions, acts at random first, and learns from random batches.
+    """Store all transitions, act at random first, and learn from random batches.
 
     Args:
         config: The configuration of the run.

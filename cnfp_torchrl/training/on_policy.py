@@ -19,7 +19,7 @@ from cnfp_torchrl.training.update import Update
 
 
 class OnPolicyLearner:
-    """Learns from each batch of transitions several times, in random parts.
+    """Learn from each batch of transitions several times, in random parts.
 
     Args:
         config: The configuration of the run.

@@ -88,7 +88,7 @@ class TrainedPolicy:
                 returns NaN would cause; then nothing is returned that could be executed.
         """
         given = observation if isinstance(observation, Mapping) else {self._only_key(): observation}
-        values = {each.key: each.value(partial(self._value, given)) for each in self._entries}
+        values = {entry.key: entry.value(partial(self._value, given)) for entry in self._entries}
         first = self._entries[0]
         batch = values[first.key].shape[: values[first.key].ndim - first.spec.ndim]
         state = TensorDict(values, batch_size=batch)
@@ -96,7 +96,7 @@ class TrainedPolicy:
             for publisher in self._publishers:
                 state = publisher(state)
             action = self._policy(state).get(self.env.action_key)
-        keys = [*self.in_keys, *(each.key for each in self._entries)]
+        keys = [*self.in_keys, *(entry.key for entry in self._entries)]
         is_numpy = any(isinstance(_found(given, key), np.ndarray) for key in keys)
         return cast(Values, action.numpy() if is_numpy else action)
 

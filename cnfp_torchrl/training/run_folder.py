@@ -331,9 +331,14 @@ class RunFolder:
     def _resuming(self) -> str:
         return f"cnfp-train resume={shlex.quote(str(self.path))}"
 
-    def how_to_resume(self, frames: int) -> str:
-        """Return a sentence for whoever stopped the run."""
-        return f"stopped and saved at step {frames}; go on with: {self._resuming()}"
+    def how_to_resume(self, frames: int | None = None) -> str:
+        """Return a sentence for whoever stopped the run.
+
+        Args:
+            frames: The steps at which it was saved; None when it was not.
+        """
+        how = "ended at once" if frames is None else f"stopped and saved at step {frames}"
+        return f"{how}; go on with: {self._resuming()}"
 
     def remove_partial_files(self) -> None:
         """Remove what is left of files that a run was writing when it was killed."""

@@ -123,7 +123,7 @@ class RunState:
 
 
 class BestPolicy:
-    """Keeps the policy that scored best without a violation.
+    """Keep the policy that scored best without a violation.
 
     Args:
         folder: The run's folder, in which it is kept as `BEST`.

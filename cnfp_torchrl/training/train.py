@@ -77,7 +77,7 @@ def train(config: DictConfig, folder: RunFolder, *, resume: bool = False) -> dic
     Raises:
         ValueError: before any work, for a setting that makes no sense.
         CheckpointError: when the state of the run cannot be written or read, or a log not written.
-        TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved.
+        TrainingInterrupted: when SIGTERM or Ctrl-C came and the state is saved, or came twice.
     """
     with closing(folder), folder.naming_what_cannot_be_written():
         return _train(config, folder, resume)
@@ -176,7 +176,7 @@ def _train(config: DictConfig, folder: RunFolder, resume: bool) -> dict[str, Any
             best.offer_evaluation(report)
 
     with closing(callback), closing(evaluations):
-        with StopRequest(STOP_SIGNALS if is_saved else ()) as stop:
+        with StopRequest(folder.how_to_resume(), STOP_SIGNALS if is_saved else ()) as stop:
             with closing(metrics), shutting_down(collector):
                 for collected in collector:
                     callback.on_batch(collected)

@@ -38,10 +38,10 @@ def foreign_resources(folder: Path) -> list[str]:
     for page in sorted(folder.rglob("*.html")):
         reader = _Resources()
         reader.feed(page.read_text(encoding="utf-8"))
-        found += [f"{page.relative_to(folder)}: {each}" for each in reader.foreign]
+        found += [f"{page.relative_to(folder)}: {address}" for address in reader.foreign]
     for sheet in sorted(folder.rglob("*.css")):
         text = sheet.read_text(encoding="utf-8")
-        found += [f"{sheet.relative_to(folder)}: {each}" for each in IN_STYLE.findall(text)]
+        found += [f"{sheet.relative_to(folder)}: {address}" for address in IN_STYLE.findall(text)]
     return found
 
 

@@ -18,9 +18,9 @@ MODULES = ("cnfp_torchrl.distributions", "cnfp_torchrl.keys")
 def rooms() -> dict[str, ModuleType]:
     """Return the packages that list public names, and the public modules, by name."""
     found = [cnfp_torchrl.__name__]
-    for each in pkgutil.walk_packages(cnfp_torchrl.__path__, f"{cnfp_torchrl.__name__}."):
-        if each.ispkg or each.name in MODULES:
-            found.append(each.name)
+    for module in pkgutil.walk_packages(cnfp_torchrl.__path__, f"{cnfp_torchrl.__name__}."):
+        if module.ispkg or module.name in MODULES:
+            found.append(module.name)
     modules = {name: importlib.import_module(name) for name in found}
     return {name: module for name, module in modules.items() if names_in(module)}
 

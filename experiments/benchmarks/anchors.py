@@ -121,12 +121,12 @@ def random_sets(rng: np.random.Generator, count: int) -> list[ConstraintSet]:
     wanted = rng.choice([-1, 1], count) * 10 ** rng.uniform(-4.5, -1.5, count)
     best = chebyshev_center(sets, share=0.99)
     shrink = best.slack - torch.from_numpy(wanted)
-    return [bounds, *(_shrunk(each, shrink) for each in sets[1:])]
+    return [bounds, *(_shrunk(constraint_set, shrink) for constraint_set in sets[1:])]
 
 
-def _shrunk(each: ConstraintSet, by: Tensor) -> ConstraintSet:
+def _shrunk(constraint_set: ConstraintSet, by: Tensor) -> ConstraintSet:
     """Return the sets with their slack lowered everywhere, as far as they stay sets."""
-    match each:
+    match constraint_set:
         case Box(low, high):
             by = torch.minimum(by.unsqueeze(-1), (high - low) / 2 - 1e-9)
             return Box(low + by, high - by)
@@ -142,8 +142,10 @@ def _shrunk(each: ConstraintSet, by: Tensor) -> ConstraintSet:
             norm = torch.tensor([_norm_bound(matrix) for matrix in jacobian.numpy()]).double()
             return TaskSpaceBall(jacobian, offset, (radius - by * norm).clamp(min=1e-9))
         case WeightedL1Ball(weights, bound) | PositivePart(weights, bound):
-            return type(each)(weights, (bound - by * weights.norm(dim=-1)).clamp(min=1e-9))
-    raise TypeError(type(each))
+            return type(constraint_set)(
+                weights, (bound - by * weights.norm(dim=-1)).clamp(min=1e-9)
+            )
+    raise TypeError(type(constraint_set))
 
 
 def _random_set(rng: np.random.Generator, anchor: Array, slack: Array) -> ConstraintSet:
@@ -193,30 +195,34 @@ def _random_set(rng: np.random.Generator, anchor: Array, slack: Array) -> Constr
     return PositivePart(tensor(weights), tensor(bound))
 
 
-def rows_of(each: ConstraintSet, index: int) -> Rows:
+def rows_of(constraint_set: ConstraintSet, index: int) -> Rows:
     """Return the slacks of the rows of one set of a batch."""
-    f = {name: value[index].double().numpy() for name, value in each.fields().items()}
-    if isinstance(each, Box):
+    f = {name: value[index].double().numpy() for name, value in constraint_set.fields().items()}
+    if isinstance(constraint_set, Box):
         identity = np.eye(len(f["low"]))
         gradient = np.concatenate([-identity, identity])
         return lambda a: (np.concatenate([f["high"] - a, a - f["low"]]), gradient)
-    if isinstance(each, HalfSpaces):
+    if isinstance(constraint_set, HalfSpaces):
         lengths = np.linalg.norm(f["normals"], axis=-1)
         normals = f["normals"] / lengths[:, None]
         return lambda a: (f["offsets"] / lengths - normals @ a, -normals)
-    if isinstance(each, Ball):
+    if isinstance(constraint_set, Ball):
         return _cone(np.eye(len(f["center"])), -f["center"], float(f["radius"]), 1.0)
-    if isinstance(each, Ellipsoid):
+    if isinstance(constraint_set, Ellipsoid):
         inverse = np.asarray(np.linalg.inv(f["scale_tril"]), dtype=np.float64)
         return _cone(inverse, -inverse @ f["center"], 1.0, _norm_bound(inverse))
-    if isinstance(each, TaskSpaceBall):
+    if isinstance(constraint_set, TaskSpaceBall):
         return _cone(f["jacobian"], f["offset"], float(f["radius"]), _norm_bound(f["jacobian"]))
     weights, bound = f["weights"], float(f["bound"])
     length = float(np.linalg.norm(weights))
 
     def sums(a: Array) -> tuple[Array, Array]:
         terms = weights * a
-        signs = np.sign(terms) if isinstance(each, WeightedL1Ball) else (terms > 0).astype(float)
+        signs = (
+            np.sign(terms)
+            if isinstance(constraint_set, WeightedL1Ball)
+            else (terms > 0).astype(float)
+        )
         slack = (bound - (signs * terms).sum()) / length
         return np.array([slack]), -(signs * weights / length)[None]
 
@@ -241,16 +247,16 @@ def _norm_bound(matrix: Array) -> float:
 
 def largest_excess(
     fixed: Sequence[tuple[Rows, Array]],
-    trial: Sequence[tuple[Rows, Array]],
+    maximized: Sequence[tuple[Rows, Array]],
     bounds: Sequence[tuple[float, float]],
     start: Array,
     precision: float,
 ) -> tuple[float, float]:
-    """Return bounds of the largest t by which slacks of sets on trial exceed what is required.
+    """Return bounds of the largest t by which slacks of maximized sets exceed what is required.
 
     Args:
         fixed: Sets with the slacks that their rows must have.
-        trial: Sets with the slacks that their rows exceed by t.
+        maximized: Sets with the slacks that their rows exceed by t.
         bounds: The bounds of the actions.
         start: An action to begin at.
         precision: How close the bounds shall come.
@@ -261,7 +267,7 @@ def largest_excess(
         """Return all rooms, their gradients in (action, t), and how often t counts."""
         every = [
             (rows(a), needs, on)
-            for sets, on in ((fixed, 0.0), (trial, 1.0))
+            for sets, on in ((fixed, 0.0), (maximized, 1.0))
             for rows, needs in sets
         ]
         room = np.concatenate([slack - needs for (slack, _), needs, _ in every])
@@ -314,11 +320,11 @@ def largest_excess(
         if solved.success:
             upper = min(upper, float(solved.x[dim]))
             candidates += [solved.x[:dim], (solved.x[:dim] + inside) / 2]
-        for each in candidates:
-            if np.isfinite(each).all():
-                cut(each)
-                if value(each) > lower:
-                    lower, inside = value(each), each
+        for point in candidates:
+            if np.isfinite(point).all():
+                cut(point)
+                if value(point) > lower:
+                    lower, inside = value(point), point
         if upper - lower <= precision or not solved.success:
             break
     return lower, upper
@@ -337,8 +343,8 @@ def compare(cases: int, seed: int, count: int = 10) -> list[Comparison]:
         for index in range(count):
             results.append(
                 _compare_one(
-                    [rows_of(each, index) for each in sets],
-                    [type(each).__name__ for each in sets],
+                    [rows_of(constraint_set, index) for constraint_set in sets],
+                    [type(constraint_set).__name__ for constraint_set in sets],
                     [depth[index] for depth in depths],
                     [amount[index] for amount in amounts],
                     found.anchor[index].numpy(),
@@ -368,11 +374,11 @@ def _compare_one(
         least = (max(-high, 0.0), max(-low, 0.0))
         relaxed = given - leeway if given > 0 else 0.0
         amounts.append(Amount(families[k], len(anchor), relaxed, least, depth))
-    widened = [(each, -amount) for each, amount in zip(rows, relaxation, strict=True)]
+    widened = [(bounding, -amount) for bounding, amount in zip(rows, relaxation, strict=True)]
     _, best = largest_excess([], widened, bounds, anchor, 0.02 * float(depths[0].min()))
     slack = min(
-        float((each(anchor)[0] + amount).min())
-        for each, amount in zip(rows, relaxation, strict=True)
+        float((bounding(anchor)[0] + amount).min())
+        for bounding, amount in zip(rows, relaxation, strict=True)
     )
     return Comparison(amounts, attempted, slack / best)
 

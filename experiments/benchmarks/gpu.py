@@ -403,7 +403,7 @@ def main() -> None:
     sizes = Sizes(quick=arguments.quick)
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # TF32, which may not break a constraint either
-    facts = about(device, sizes)
+    circumstances = about(device, sizes)
     results: dict[str, Rows] = {}
     parts = [count_violations, count_waits, time_environment, time_updates, time_layer]
     if not (arguments.no_compile or arguments.quick):
@@ -411,17 +411,17 @@ def main() -> None:
     for part in parts:
         spent = time.perf_counter() - STARTED
         if part is time_compiled and spent > arguments.seconds:
-            facts["compiled update"] = f"left out after {spent:.0f} s"
+            circumstances["compiled update"] = f"left out after {spent:.0f} s"
             continue
         try:  # the other parts are not lost with one of them
             results |= part(sizes, device)
         except Exception as error:
-            facts[f"{part.__name__} failed"] = f"{type(error).__name__}: {error}"[:500]
-        facts["seconds"] = round(time.perf_counter() - STARTED, 1)
-        print(part.__name__, facts["seconds"], "s", flush=True)
-        write(arguments.out / "gpu.json", "On a GPU", facts, results)
+            circumstances[f"{part.__name__} failed"] = f"{type(error).__name__}: {error}"[:500]
+        circumstances["seconds"] = round(time.perf_counter() - STARTED, 1)
+        print(part.__name__, circumstances["seconds"], "s", flush=True)
+        write(arguments.out / "gpu.json", "On a GPU", circumstances, results)
     print((arguments.out / "gpu.md").read_text())
-    failed = [key for key in facts if key.endswith("failed")]
+    failed = [key for key in circumstances if key.endswith("failed")]
     broken = [row for rows in results.values() for row in rows.values() if row.get("violations")]
     if failed or broken:
         sys.exit(f"failed: {failed}; violations: {broken}")

@@ -177,6 +177,6 @@ def write(
         "Medians over rounds in which all take turns; ratios of time to the first row of a table, "
     )
     lines += [" ".join([f"{rule}taken within a round, with quartiles.", *notes]), ""]
-    for each, rows in results.items():
-        lines += table(each, rows)
+    for title, rows in results.items():
+        lines += table(title, rows)
     path.with_suffix(".md").write_text("\n".join(lines))

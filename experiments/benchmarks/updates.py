@@ -293,9 +293,9 @@ def write(folder: Path, results: dict[str, dict[str, Any]], load: dict[str, Any]
         "Medians over rounds in which all take turns; the ratio is taken within a round. Of times "
         "less is better, of steps a second more."
     ]
-    for title, each in results.items():
-        lines += ["", f"## {title} ({each['rounds']} rounds)", ""]
-        lines += table(each["rows"], each["unit"])
+    for title, result in results.items():
+        lines += ["", f"## {title} ({result['rounds']} rounds)", ""]
+        lines += table(result["rows"], result["unit"])
     (folder / "updates.md").write_text("\n".join([*lines, ""]))
 
 

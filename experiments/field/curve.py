@@ -17,7 +17,7 @@ CURVE = "curve.json"
 
 
 class Curve:
-    """Takes every step of training.
+    """Take every step of training.
 
     Args:
         agents: The number of agents that act together.
@@ -69,7 +69,7 @@ class Curve:
 
 
 class CurveCallback:
-    """Keeps the curve of a training run beside it; takes the place of a stream to a viewer.
+    """Keep the curve of a training run beside it; take the place of a stream to a viewer.
 
     Args:
         warmup: See `Curve`.

@@ -229,10 +229,10 @@ def _name_rows_once(panels: Sequence[Axes], columns: int) -> None:
 def _draw_curves(axes: Axes, runs: Runs, curve: Callable[[Record], Series]) -> float:
     """Draw a curve of every method; return the highest value of all bands."""
     highest = 0.0
-    for place, (method, records) in enumerate(runs.items()):
+    for rank, (method, records) in enumerate(runs.items()):
         shown = band([curve(run) for run in records])
         highest = max(highest, float(shown.high.max()))
-        draw_band(axes, label(method), shown, place=place, of=len(runs))
+        draw_band(axes, label(method), shown, rank=rank, of=len(runs))
     step_axis(axes)
     return highest
 

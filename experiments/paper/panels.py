@@ -19,25 +19,25 @@ _MARKS = 6
 _NAME_SIZE = 9.0
 
 
-def draw_band(axes: Axes, label: Label, band: Band, *, place: int, of: int) -> None:
+def draw_band(axes: Axes, label: Label, band: Band, *, rank: int, of: int) -> None:
     """Draw a method's curve and the band of its intervals.
 
     Args:
         axes: A panel.
         label: The label of the method.
         band: What is drawn.
-        place: The place of the method among those of the panel; the first lies above the others,
+        rank: The rank of the method among those of the panel; the first lies above the others,
             and markers stand apart, so that curves that coincide, as at 0, can still be told.
         of: The number of methods in the panel.
     """
-    x, every, layer = band.steps, max(of, len(band.steps) // _MARKS), of - place
+    x, every, layer = band.steps, max(of, len(band.steps) // _MARKS), of - rank
     axes.fill_between(
         x, band.low, band.high, color=label.color, alpha=0.18, linewidth=0, zorder=2 + layer
     )
     axes.plot(x, band.value, color=label.color, linewidth=1.5, zorder=2 + layer)
     axes.plot(
         x, band.value, label.marker, color=label.color, markersize=5,
-        markevery=(every * place // of, every), markeredgecolor="white", markeredgewidth=0.6,
+        markevery=(every * rank // of, every), markeredgecolor="white", markeredgewidth=0.6,
         zorder=2 + of + layer,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cache, partial
 
@@ -39,7 +39,7 @@ from cnfp_torchrl.geometry import (
 from tests.bijectors import reference
 
 FLOWS = {
-    "aligned": reference.aligned_squash,
+    "exact": reference.exact_squash,
     "gauge": reference.gauge_squash,
     "radial": reference.radial_squash,
     "retraction": reference.gauge_squash,
@@ -56,7 +56,7 @@ class Case:
 
     Args:
         name: The name for the test's id.
-        kind: The kind: squash, chain (the paper's), aligned, gauge, radial, retraction, soft,
+        kind: The kind: squash, chain (the paper's), exact, gauge, radial, retraction, soft,
             soft-rays, soft-alone or recession.
         sets: The sets in order of application, float64 of values that float32 holds too.
         anchor: The anchor of the kinds that have one, ``(*batch, d)``.
@@ -129,7 +129,7 @@ class Case:
                 return SquashChain(
                     [paper_squash(constraint_set) for constraint_set in self.cast(dtype)]
                 )
-            case "aligned":
+            case "exact":
                 return ExactSquash(self.region(dtype))
             case "gauge":
                 return GaugeSquash(self.region(dtype))
@@ -201,17 +201,21 @@ def reference_chain(
     return flow
 
 
-def cast(each: ConstraintSet, dtype: torch.dtype) -> ConstraintSet:
-    return type(each)(**{name: value.to(dtype) for name, value in each.fields().items()})
+def cast(constraint_set: ConstraintSet, dtype: torch.dtype) -> ConstraintSet:
+    return type(constraint_set)(
+        **{name: value.to(dtype) for name, value in constraint_set.fields().items()}
+    )
 
 
-def element(each: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]) -> ConstraintSet:
+def element(
+    constraint_set: ConstraintSet, batch_shape: torch.Size, index: tuple[int, ...]
+) -> ConstraintSet:
     """Return one set out of a batch."""
     values = {}
-    for name, value in each.fields().items():
-        event = value.shape[value.ndim - each.event_dims[name] :]
+    for name, value in constraint_set.fields().items():
+        event = value.shape[value.ndim - constraint_set.event_dims[name] :]
         values[name] = value.expand((*batch_shape, *event))[index]
-    return type(each)(**values)
+    return type(constraint_set)(**values)
 
 
 # Random sets around an anchor. All numbers are rounded to float32, so that both dtypes mean the
@@ -494,7 +498,7 @@ def exact_flows() -> tuple[Case, ...]:
         smooth = len(sets) == 1
         found.append(Case(f"gauge-{name}", "gauge", sets, anchor, active, smooth=smooth))
         boxes = all(isinstance(constraint_set, Box) for constraint_set in sets)
-        found.append(Case(f"aligned-{name}", "aligned", sets, anchor, active, smooth=boxes))
+        found.append(Case(f"exact-{name}", "exact", sets, anchor, active, smooth=boxes))
         found.append(Case(f"radial-{name}", "radial", sets, anchor, active))
         found.append(Case(f"soft-{name}", "soft", sets, anchor, active))
     for name in (
@@ -550,3 +554,8 @@ def latents(case: Case, count: int, dtype: torch.dtype, length: float | None = N
     axis = torch.where(z.abs() == z.abs().amax(-1, keepdim=True), z, 0.0)
     z = torch.where(kind < 0.6, z, torch.where(kind < 0.8, z.sign(), axis))
     return (z / z.norm(dim=-1, keepdim=True) * length).to(dtype)
+
+
+def latents_of(case: Case, count: int, dtype: torch.dtype, lengths: Iterable[float]) -> Tensor:
+    """Return base samples of several lengths, ``(lengths * count, *batch, d)``."""
+    return torch.cat([latents(case, count, dtype, length) for length in lengths])

@@ -33,19 +33,19 @@ Vector = list[mpf]
 
 
 def contains(
-    each: ConstraintSet, action: Tensor, number: type[np.floating] = np.float64
+    constraint_set: ConstraintSet, action: Tensor, number: type[np.floating] = np.float64
 ) -> NDArray[np.bool_]:
     """Tell, in NumPy, whether actions lie in a set, on the exact values of all tensors.
 
     Args:
-        each: The set.
+        constraint_set: The set.
         action: ``(*sample, *batch, d)``.
         number: The type to compute in, longer than the tensors' own: its rounding errors must be
             far below the distance of two neighboring actions.
     """
     a = action.detach().numpy().astype(number)
-    fields = {name: value.numpy().astype(number) for name, value in each.fields().items()}
-    match each:
+    fields = {name: value.numpy().astype(number) for name, value in constraint_set.fields().items()}
+    match constraint_set:
         case Box():
             return ((fields["low"] <= a) & (a <= fields["high"])).all(-1)
         case Ball():
@@ -65,7 +65,7 @@ def contains(
             return (image**2).sum(-1) <= fields["radius"] ** 2
         case VisibleRegion():
             return _sees(fields, a)
-    raise NotImplementedError(type(each).__name__)
+    raise NotImplementedError(type(constraint_set).__name__)
 
 
 def _forward_substitution(
@@ -102,10 +102,10 @@ def _sees(fields: dict[str, NDArray[np.floating]], a: NDArray[np.floating]) -> N
     return (beside.any(-1) | across).all(-1)
 
 
-def level(each: ConstraintSet, action: Vector) -> mpf:
+def level(constraint_set: ConstraintSet, action: Vector) -> mpf:
     """Return, in mpmath, a number that is at most 1 exactly on the set, which has no batch."""
-    fields = {name: to_mp(value) for name, value in each.fields().items()}
-    match each:
+    fields = {name: to_mp(value) for name, value in constraint_set.fields().items()}
+    match constraint_set:
         case Box():
             pairs = zip(fields["low"], fields["high"], action, strict=True)
             return 1 + max(max(low - a, a - high) for low, high, a in pairs)
@@ -127,7 +127,7 @@ def level(each: ConstraintSet, action: Vector) -> mpf:
         case TaskSpaceBall():
             rows = zip(fields["jacobian"], fields["offset"], strict=True)
             return mp.sqrt(sum((dot(row, action) + b) ** 2 for row, b in rows)) / fields["radius"]
-    raise NotImplementedError(type(each).__name__)
+    raise NotImplementedError(type(constraint_set).__name__)
 
 
 def box_squash(box: Box, latent: Vector) -> tuple[Vector, mpf]:
@@ -174,7 +174,7 @@ def gauge_squash(
     return along(c, offset, share), log_det + len(latent) * mp.log(share)
 
 
-def aligned_squash(
+def exact_squash(
     sets: Sequence[ConstraintSet], anchor: Tensor, latent: Vector
 ) -> tuple[Vector, mpf]:
     """Scale each component to the intersection of the boxes, then retract from there."""

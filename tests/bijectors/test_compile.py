@@ -60,7 +60,7 @@ def build(case: Case, fields: list[dict[str, Tensor]], anchor: Tensor) -> Biject
         squash = BoxSquash(outer.low, outer.high, validate_args=False)
         return SquashChain([squash, Retraction(outer, sets[1], anchor)])
     region = Region(sets, anchor, case.active)
-    if case.kind == "aligned":
+    if case.kind == "exact":
         return ExactSquash(region, validate_args=False)
     if case.kind == "gauge":
         return GaugeSquash(region, validate_args=False)

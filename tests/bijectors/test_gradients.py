@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cnfp_torchrl.bijectors import Bijector, GaugeSquash
 from cnfp_torchrl.geometry import Ball, Box, Region
-from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, tensor
+from tests.bijectors.cases import CASES, DTYPES, Case, cast, latents, latents_of, tensor
 from tests.bijectors.numeric import central_difference
 
 ids = {"ids": lambda case: case.name}
@@ -26,16 +26,16 @@ def gradients(bijector: Bijector, latent: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_gradients_are_finite(case: Case, dtype: torch.dtype) -> None:
-    bijector = case.build(dtype)
-    for length in (0.0, 1e-40, 1e-25, 1e-18, 1e-12, 1.0, 8.0, 20.0, 1e6, 1e15):
-        for gradient in gradients(bijector, latents(case, 20, dtype, length)):
-            assert gradient.isfinite().all(), f"at |z| = {length}"
+    lengths = (0.0, 1e-40, 1e-25, 1e-18, 1e-12, 1.0, 8.0, 20.0, 1e6, 1e15)
+    z = latents_of(case, 20, dtype, lengths)
+    for gradient in gradients(case.build(dtype), z):
+        assert z[~gradient.isfinite()].tolist() == []
 
 
 @pytest.mark.parametrize("case", CASES, **ids)
 def test_gradients_equal_finite_differences(case: Case) -> None:
     bijector = case.build(torch.float64)
-    z = torch.cat([latents(case, 8, torch.float64, length) for length in (0.3, 1.0, 3.0)])
+    z = latents_of(case, 8, torch.float64, (0.3, 1.0, 3.0))
     # A step across a kink tells nothing; on the axes and diagonals of `latents` there are some.
     z = z + 0.01 * torch.randn_like(z)
     direction = torch.randn_like(z)
@@ -114,7 +114,7 @@ def test_log_det_gradient_grows_like_one_over_the_distance_to_the_anchor() -> No
 def test_radial_squash_has_a_gradient_at_zero() -> None:
     """A policy whose last layer starts at zero sends z = 0, and without a gradient stays there."""
     sets = Box(tensor(-1.0, -1.0), tensor(1.0, 1.0)), Ball(tensor(0.2, 0.0), tensor(0.5).squeeze())
-    for kind in ("aligned", "gauge", "radial"):
+    for kind in ("exact", "gauge", "radial"):
         bijector = Case("", kind, sets, tensor(0.0, 0.0)).build(torch.float32)
         of_action, _ = gradients(bijector, torch.zeros(2))
         assert (of_action > 0.1).all()

@@ -32,7 +32,7 @@ SHORTER = {
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    for module in [each for each in sys.modules if each.partition(".")[0] == NAME]:
+    for module in [name for name in sys.modules if name.partition(".")[0] == NAME]:
         del sys.modules[module]
 
 

@@ -7,14 +7,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
 from cnfp_torchrl.commands.sweep import main as sweep_command
+from cnfp_torchrl.training.interruption import STOP_SIGNALS
 from cnfp_torchrl.training.run_folder import STATES, SUMMARY, RunFolder
-from tests.entry_points import run_command
+from tests.entry_points import call_command, run_command
 
 TINY = [
     "collector.total_frames=96",
@@ -34,7 +36,9 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> None:
+def test_a_failed_run_stops_no_other_and_is_told_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     sweep = tmp_path / "a=1,[b] c"
     broken = ["optim.lr=1e30,0.001", "training.update_ratio=1"]
     arguments = ["-m", *TINY, *broken, f"hydra.sweep.dir='{sweep}'"]
@@ -55,19 +59,32 @@ def test_a_failed_run_stops_no_other_and_is_told_with_them(tmp_path: Path) -> No
     assert all(len(line) <= 100 for line in printed[:3])
     # What refuses to go on with a complete run says nothing of it.
     complete = sweep / second["folder"]
-    refused = run_command(tmp_path, "cnfp-train", f"resume={complete}")
-    assert refused.returncode == 1
-    assert "has finished with 96 steps" in refused.stderr
+    monkeypatch.chdir(tmp_path)
+    assert call_command("cnfp-train", f"resume='{complete}'") == 1
+    assert "has finished with 96 steps" in capsys.readouterr().err
     assert RunFolder(complete).load_failure() is None
     assert RunFolder(sweep / first["folder"]).load_failure() is not None
 
 
-def test_a_launcher_that_is_refused_before_the_first_run_is_explained(tmp_path: Path) -> None:
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back the signals that a sweep in this process takes."""
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_launcher_that_is_refused_before_the_first_run_is_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     wrong = ["hydra/launcher=submitit_local", "+hydra.launcher.partition=none"]
-    done = run_command(tmp_path, "cnfp-train", "-m", *TINY, "seed=0,1", *wrong)
-    assert done.returncode == 1
-    assert "partition" in done.stderr.partition("\n")[0]
-    assert "holds no run" not in done.stderr
+    assert call_command("cnfp-train", "-m", *TINY, "seed=0,1", *wrong) == 1
+    told = capsys.readouterr().err
+    assert "partition" in told.partition("\n")[0]
+    assert "holds no run" not in told
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +147,7 @@ def test_a_killed_process_takes_no_run_with_it(tmp_path: Path) -> None:
     longer = ["collector.total_frames=960", "checkpoint.interval=48", "hydra.launcher.n_jobs=2"]
     process = begin_side_by_side(sweep, *longer, "seed=0,1,2")
     workers = psutil.Process(process.pid).children()
-    (killed,) = (each for each in workers if works_in(sweep / "0_seed-0", each))
+    (killed,) = (worker for worker in workers if works_in(sweep / "0_seed-0", worker))
     killed.kill()
     _, told = process.communicate()
     assert process.returncode == 0, told

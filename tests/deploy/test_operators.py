@@ -35,7 +35,7 @@ def test_hypot_neither_overflows_nor_underflows() -> None:
     torch.manual_seed(0)
     sizes = 10.0 ** torch.arange(-30, 31)
     first, second = torch.randn(2, 61) * sizes
-    first, second = (torch.cat([each, torch.tensor([0.0, torch.inf])]) for each in (first, second))
+    first, second = (torch.cat([part, torch.tensor([0.0, torch.inf])]) for part in (first, second))
     with OperatorsOfOnnx():
         found = torch.hypot(first, second)
     torch.testing.assert_close(found, torch.hypot(first, second), rtol=1e-6, atol=0)

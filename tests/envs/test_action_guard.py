@@ -57,7 +57,7 @@ def assert_guards(env: EnvBase, actor: SafeProbabilisticTensorDictSequential) ->
     """Let the actor act over many episodes, and random actions not at all."""
     # Serial environments share tensors with their workers, which gradients do not allow.
     with torch.no_grad():
-        rollout = env.rollout(120, actor, break_when_any_done=False)
+        rollout = env.rollout(50, actor, break_when_any_done=False)
     assert rollout["next", "done"].any()
     assert rollout["next", "cost"].sum() == 0
     with pytest.raises(ConstraintViolationError, match=r"constraint '(battery|obstacle)'"):
@@ -100,7 +100,7 @@ def test_on_the_gymnasium_environment() -> None:
 def test_agents_that_are_reset_alone() -> None:
     env = guarded_env(AGENTS, steps=1000)
     actor, state = untrained_actor(env), env.reset()
-    for _ in range(200):
+    for _ in range(60):
         _, state = env.step_and_maybe_reset(actor(state))
         state = env.reset(state.set("_reset", torch.rand(AGENTS, 1) < 0.1))
 

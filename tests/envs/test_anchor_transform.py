@@ -41,7 +41,7 @@ from tests.copies import EVERY_COPY
 
 ORDER = ["battery", "obstacle"]
 
-# Of the anchor, on the reference layout: half of what the safe action has (`point_nav_geometry`).
+# Of the anchor, on the reference layout: half of what a move along the way has.
 LEAST_SLACK = 0.025
 
 
@@ -167,22 +167,10 @@ def test_and_in_the_tightest_states_in_which_all_constraints_hold(battery: int) 
         assert slack.min() >= LEAST_SLACK, name
 
 
-def test_without_a_candidate_a_anchor_is_found_all_the_same() -> None:
-    class NoHint(BatteryGeometry):
-        def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> None:
-            return None
-
-    env = with_anchor(PointNavEnv((50,), seed=0), ObstacleGeometry(), NoHint(), order=ORDER)
-    rollout = env.rollout(20, safe_random_policy(env), break_when_any_done=False)
-    assert rollout["next", "cost"].sum() == 0
-    for name, slack in slacks(rollout, rollout["constraints", "anchor"]).items():
-        assert slack.min() > 0.01, name
-
-
 def test_a_wrong_candidate_does_no_harm() -> None:
     class WrongHint(BatteryGeometry):
         def safe_action(self, tensordict: TensorDictBase, allowed: ConstraintSet) -> Tensor:
-            right = super().safe_action(tensordict, allowed)
+            right = allowed.fields()["center"].clamp(-0.5, 0.5)
             wrong = torch.tensor([[-5.0, 5.0], [torch.nan, 0.0], [0.0, 1.0]])
             return torch.cat([wrong, right[3:]])
 

@@ -16,7 +16,8 @@ from cnfp_torchrl.training.networks import gaussian_network
 
 
 def make_env(*batch_size: int, **options: bool | str) -> TransformedEnv:
-    env = constrain_env(PointNavEnv(batch_size, seed=0), BatteryGeometry(), ObstacleGeometry())
+    base = PointNavEnv(batch_size, max_steps=25, seed=0)
+    env = constrain_env(base, BatteryGeometry(), ObstacleGeometry())
     # The guard stands between the flow and the environment, and sees what is executed.
     return env.append_transform(ActionGuard()).append_transform(ConstrainedActions(**options))
 
@@ -26,7 +27,7 @@ def make_env(*batch_size: int, **options: bool | str) -> TransformedEnv:
 def test_random_actions_are_safe(flow: str, unbounded: bool) -> None:
     torch.manual_seed(0)
     env = make_env(16, flow=flow, unbounded=unbounded)
-    steps = env.rollout(120, break_when_any_done=False)
+    steps = env.rollout(60, break_when_any_done=False)
     assert steps["next", "done"].any()
     assert steps["next", "cost"].sum() == 0
     executed, free = steps["next", "executed_action"], steps["action"]
@@ -53,7 +54,7 @@ def _Wide(env: PointNavEnv) -> PointNavEnv:
 @pytest.mark.parametrize("copied", [lambda env: env, copy.deepcopy])
 def test_in_workers_and_copies(copied: Callable[[EnvBase], EnvBase]) -> None:
     env = SerialEnv(2, lambda: copied(make_env()))
-    assert env.rollout(110, break_when_any_done=False)["next", "cost"].sum() == 0
+    assert env.rollout(60, break_when_any_done=False)["next", "cost"].sum() == 0
 
 
 def test_collectors_warm_up_at_random_within_the_constraints() -> None:

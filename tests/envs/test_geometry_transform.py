@@ -443,7 +443,9 @@ FAMILIES: list[tuple[ConstraintSet, str]] = [
 
 def is_sound(sets: ConstraintSet) -> bool:
     found = sets.evidence()
-    return are_within([each.value.item() for each in found], [each.limit for each in found])
+    return are_within(
+        [evidence.value.item() for evidence in found], [evidence.limit for evidence in found]
+    )
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e35, -1.0, 3.0])

@@ -70,12 +70,12 @@ def test_an_environment_without_costs_is_refused() -> None:
 # In the trainer -----------------------------------------------------------------------------------
 
 
-def penalised(*overrides: str) -> DictConfig:
+def penalized(*overrides: str) -> DictConfig:
     return compose_config("experiment=penalty", *overrides)
 
 
-def test_only_training_is_penalised() -> None:
-    config = penalised()
+def test_only_training_is_penalized() -> None:
+    config = penalized()
     for chosen, expected in ((True, True), (False, False)):
         env = build_environment(config, batch_size=[64], with_penalty=chosen)
         data = env.rollout(20, break_when_any_done=False)
@@ -96,7 +96,7 @@ def test_a_number_is_a_penalty_too_and_zero_is_none(number: str, paid: float | N
 
 
 def test_a_run_learns_from_the_penalty_and_reports_the_raw_return(tmp_path: Path) -> None:
-    config = penalised(
+    config = penalized(
         "env.penalty.penalty=1e6",
         "collector.total_frames=256",
         "training.warmup_frames=192",

@@ -1,4 +1,4 @@
-"""A place of their own for the examples, and what watches them."""
+"""A folder of their own for the examples, and what records what they train."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.examples.scripts import EXAMPLES
 
 
 @pytest.fixture(autouse=True)
-def place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def working_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Examples import each other; MuJoCo leaves a log where it runs."""
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.chdir(tmp_path)

@@ -113,10 +113,10 @@ def test_what_is_required_is_kept() -> None:
     chosen = [Box(-ones, ones), Ball(3 * ones * torch.tensor([1.0, 0.0]), ones[:, 0])]
     intersection = Intersection.of(chosen)
     counts = np.ones((1, 5), dtype=bool)
-    trial = np.array([[False] * 4 + [True]])
+    maximized = np.array([[False] * 4 + [True]])
     for least in (0.0, 0.1):
         required = np.array([[least] * 4 + [0.0]])
-        best = intersection.maximize(required, trial, counts, np.zeros((1, 2)), close)
+        best = intersection.maximize(required, maximized, counts, np.zeros((1, 2)), close)
         assert best.slack.item() == pytest.approx(-1 - least, abs=1e-6)
         np.testing.assert_allclose(best.action, [[1 - least, 0.0]], rtol=0, atol=1e-3)
 
@@ -128,13 +128,15 @@ def test_the_closed_form_is_what_newtons_method_finds() -> None:
     half = 0.3 + 0.5 * torch.rand(batch, dim).double()
     ball = Ball(2 * torch.randn(batch, dim).double(), 0.1 + torch.rand(batch).double())
     rows = HalfSpaces(torch.randn(batch, 2, dim).double(), torch.randn(batch, 2).double() - 1)
-    for each, count in ((ball, 1), (rows, 2)):
-        intersection = Intersection.of([Box(-ones, ones), Box(-half, 0.8 * half), each])
+    for constraint_set, count in ((ball, 1), (rows, 2)):
+        intersection = Intersection.of([Box(-ones, ones), Box(-half, 0.8 * half), constraint_set])
         counts = np.ones((batch, 4 * dim + count), dtype=bool)
-        trial = counts & (np.arange(4 * dim + count) >= 4 * dim)
+        maximized = counts & (np.arange(4 * dim + count) >= 4 * dim)
         required = np.full(counts.shape, 1e-3)
         at = intersection.described
-        problem = intersection.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
+        problem = intersection.program.requiring(
+            required[:, at].T, maximized[:, at].T, counts[:, at].T
+        )
         start, asked = np.zeros((batch, dim)), []
 
         def watched(lower: Array, upper: Array, index: Index) -> Flags:

@@ -159,9 +159,9 @@ def points(case: Case, count: int) -> Tensor:
 def by_scipy(case: Case, point: Tensor) -> Tensor:
     """Solve the same problem from its inequalities, which share no code with the sets."""
 
-    def inequality(each: ConstraintSet) -> Callable[[np.ndarray], np.ndarray]:
-        fields = {name: value.numpy() for name, value in each.fields().items()}
-        match each:
+    def inequality(constraint_set: ConstraintSet) -> Callable[[np.ndarray], np.ndarray]:
+        fields = {name: value.numpy() for name, value in constraint_set.fields().items()}
+        match constraint_set:
             case Box():
                 return lambda a: np.concatenate([fields["high"] - a, a - fields["low"]])
             case Ball():
@@ -171,8 +171,8 @@ def by_scipy(case: Case, point: Tensor) -> Tensor:
                 return lambda a: (fields["offsets"] - fields["normals"] @ a)[finite]
             case WeightedL1Ball() | PositivePart():
                 # All half-spaces, one for each choice of a side of every term.
-                sides = (-1, 1) if isinstance(each, WeightedL1Ball) else (0, 1)
-                rows = np.array(list(product(sides, repeat=each.dim))) * fields["weights"]
+                sides = (-1, 1) if isinstance(constraint_set, WeightedL1Ball) else (0, 1)
+                rows = np.array(list(product(sides, repeat=constraint_set.dim))) * fields["weights"]
                 return lambda a: fields["bound"] - rows @ a
             case Ellipsoid():
                 inverse = np.linalg.inv(fields["scale_tril"])
@@ -180,7 +180,7 @@ def by_scipy(case: Case, point: Tensor) -> Tensor:
             case TaskSpaceBall():
                 jacobian, offset = fields["jacobian"], fields["offset"]
                 return lambda a: fields["radius"] ** 2 - np.sum((jacobian @ a + offset) ** 2)
-        raise NotImplementedError(type(each).__name__)
+        raise NotImplementedError(type(constraint_set).__name__)
 
     found = minimize(
         lambda a: 0.5 * np.sum((a - point.numpy()) ** 2),

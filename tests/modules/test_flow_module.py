@@ -407,7 +407,7 @@ def test_moving_to_a_device_takes_the_bounds_along() -> None:
         lambda module: module.double(),
         lambda module: module.to(torch.float16),
         lambda module: module.to("meta").to_empty(device="cpu"),
-        lambda module: module.apply(lambda each: each._apply(lambda tensor: tensor * 2)),
+        lambda module: module.apply(lambda part: part._apply(lambda tensor: tensor * 2)),
     ],
 )
 def test_nothing_else_changes_the_bounds(change: Callable[..., nn.Module]) -> None:

@@ -131,10 +131,10 @@ def assert_equal(losses: list[SACLoss], batch: TensorDictBase) -> None:
             value = outputs[-1][name].sum()
             if not value.requires_grad:
                 continue
-            each = torch.autograd.grad(
+            found = torch.autograd.grad(
                 value, list(parameters.values()), retain_graph=True, allow_unused=True
             )
-            gradients.append({(name, key): g for key, g in zip(parameters, each, strict=True)})
+            gradients.append({(name, key): g for key, g in zip(parameters, found, strict=True)})
     assert set(outputs[0].keys()) == set(outputs[1].keys())
     for name, expected in outputs[0].items():
         torch.testing.assert_close(outputs[1][name], expected, rtol=1e-4, atol=1e-5, msg=name)

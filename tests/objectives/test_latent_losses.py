@@ -51,13 +51,13 @@ def test_td3_asks_its_critic_about_allowed_actions_alone(
     SoftUpdate(loss, tau=0.1)  # TorchRL warns without one
     forward = FlowMap.forward
 
-    def watching(self: FlowMap, tensordict: TensorDictBase) -> TensorDictBase:
+    def recorded(self: FlowMap, tensordict: TensorDictBase) -> TensorDictBase:
         mapped = forward(self, tensordict)
         if not torch._C._functorch.is_functorch_wrapped_tensor(mapped["action"]):
             asked.append((mapped.clone(), mapped["action"]))
         return mapped
 
-    monkeypatch.setattr(FlowMap, "forward", watching)
+    monkeypatch.setattr(FlowMap, "forward", recorded)
     steps = env.rollout(4, split_at_latent(actor).policy).reshape(-1)
     out = loss(steps)
     assert set(out.keys()) == {"loss_actor", "loss_qvalue"}

@@ -28,8 +28,8 @@ def test_curves_that_coincide_can_be_told() -> None:
     figure = new_figure(4, 3)
     axes = figure.add_subplot()
     x, zero = np.arange(30.0), np.zeros(30)
-    for place, label in enumerate(LABELS):
-        draw_band(axes, label, Band(x, zero, zero, zero), place=place, of=len(LABELS))
+    for rank, label in enumerate(LABELS):
+        draw_band(axes, label, Band(x, zero, zero, zero), rank=rank, of=len(LABELS))
     step_axis(axes)
     count_axis(axes.yaxis, 0)
     legend_below(figure, LABELS)

@@ -40,7 +40,7 @@ def test_every_algorithm_trains_all_that_it_has(name: str, flow: str, tiny_run: 
     start, _ = tiny_run(
         *ALGORITHMS[name], f"flow={flow}", "training.update_ratio=0", "optim.lr=1e-30"
     )
-    before, after = (each.load_checkpoint()["loss"] for each in (start, folder))
+    before, after = (run.load_checkpoint()["loss"] for run in (start, folder))
     parts = {key.split(".")[0] for key in after if key.split(".")[0].endswith("_params")}
     assert len(parts) >= 2
     for part in parts:

@@ -115,7 +115,7 @@ def test_weights_arrive_in_the_workers(kind: str) -> None:
             with torch.no_grad():
                 *_, bias = actor.parameters()
                 bias += 0.5
-    assert sum(each.numel() for each in seen) >= 192 * 5
+    assert sum(batch.numel() for batch in seen) >= 192 * 5
     # Each worker draws its own starts.
     first = torch.cat(seen[:2]).reshape(-1, 5)
     assert len(first.unique(dim=0)) == len(first)
@@ -258,7 +258,7 @@ def test_no_worker_outlives_a_run_that_is_killed(kind: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_a_worker_that_is_killed_ends_the_run(kind: str, tmp_path: Path) -> None:
     process, workers = begin(kind, tmp_path / "run")
-    killed = next(each for each in workers if "spawn_main" in " ".join(each.cmdline()))
+    killed = next(worker for worker in workers if "spawn_main" in " ".join(worker.cmdline()))
     killed.kill()
     _, told = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1

@@ -103,7 +103,7 @@ def test_without_geometry_costs_are_counted_all_the_same() -> None:
 def test_the_log_has_shares_and_amounts_since_the_last_entry(tmp_path: Path) -> None:
     def rows(name: str) -> list[list[float]]:
         lines = (tmp_path / "log" / "scalars" / f"{name}.csv").read_text().splitlines()
-        return [[float(each) for each in line.split(",")] for line in lines]
+        return [[float(number) for number in line.split(",")] for line in lines]
 
     env = walls(Walls([HOLDS] * 3 + [MISSED], agents=4))
     env.append_transform(RewardSum())

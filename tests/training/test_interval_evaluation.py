@@ -26,7 +26,12 @@ def test_training_goes_the_same_way_with_and_without(tiny_run: TinyRun) -> None:
     folder, summary = tiny_run(*EVALUATED)
     without, plain = tiny_run("evaluation.interval=null")
     # Batches have 16 steps: the first ones that end beyond 50, 100 and 150, and the last one.
-    assert [each["step"] for each in summary["evaluations_in_training"]] == [64, 112, 160, 192]
+    assert [evaluation["step"] for evaluation in summary["evaluations_in_training"]] == [
+        64,
+        112,
+        160,
+        192,
+    ]
     assert plain["evaluations_in_training"] == []
     assert summary["return_mean"] == plain["return_mean"]
     trained, expected = folder.load_checkpoint()["actor"], without.load_checkpoint()["actor"]
@@ -37,12 +42,12 @@ def test_what_is_logged_is_what_the_summary_says(tiny_run: TinyRun) -> None:
     folder, summary = tiny_run(*EVALUATED)
     history = summary["evaluations_in_training"]
     for name, key in {"return": "return_mean", "score": "score"}.items():
-        expected = [(each["step"], pytest.approx(each[key])) for each in history]
+        expected = [(evaluation["step"], pytest.approx(evaluation[key])) for evaluation in history]
         assert rows(folder, f"evaluation/{name}") == expected
     for name in ("obstacle", "battery"):
         assert [value for _, value in rows(folder, f"evaluation/violations_{name}")] == [0, 0, 0, 0]
-        assert all(each["violations"][name] == 0 for each in history)
-    assert all(each["episodes"] == 3 for each in history)
+        assert all(evaluation["violations"][name] == 0 for evaluation in history)
+    assert all(evaluation["episodes"] == 3 for evaluation in history)
 
 
 def test_the_best_policy_is_that_of_the_best_evaluation(

@@ -17,7 +17,7 @@ def make_metrics(path: Path, *, interval: int = 100) -> Metrics:
 
 def rows(path: Path, name: str) -> list[list[float]]:
     lines = (path / "metrics" / "scalars" / f"{name}.csv").read_text().splitlines()
-    return [[float(each) for each in line.split(",")] for line in lines]
+    return [[float(number) for number in line.split(",")] for line in lines]
 
 
 def steps(count: int, *, cost: float = 0.0, episode_return: float | None = None) -> TensorDict:

@@ -154,13 +154,13 @@ def test_a_signal_stops_a_run_when_it_is_saved(
         if self.frames == 112:
             os.kill(os.getpid(), number)
 
-    handlers = [signal.getsignal(each) for each in STOP_SIGNALS]
+    handlers = [signal.getsignal(number) for number in STOP_SIGNALS]
     with monkeypatch.context() as patch:
         patch.setattr(Metrics, "add_steps", counting)
         with pytest.raises(TrainingInterrupted, match="step 112") as stopped:
             train(compose_config(*TINY), folder)
     assert f"resume={tmp_path / 'stopped'}" in str(stopped.value)
-    assert handlers == [signal.getsignal(each) for each in STOP_SIGNALS]
+    assert handlers == [signal.getsignal(number) for number in STOP_SIGNALS]
     go_on(folder.path)
     assert not differences(whole, folder.path)
 
@@ -180,19 +180,20 @@ def test_a_signal_ends_the_evaluation_at_once(
 
 
 def test_a_second_signal_stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    with StopRequest() as stop:
+    with StopRequest("ended") as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.signal == signal.SIGTERM
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(TrainingInterrupted, match="ended") as raised:
             os.kill(os.getpid(), signal.SIGINT)
+        assert raised.value.number == signal.SIGINT
     clock = iter([100.0, 100.5, 101.5])
     monkeypatch.setattr(
         "cnfp_torchrl.training.interruption.time", SimpleNamespace(monotonic=clock.__next__)
     )
-    with StopRequest():
+    with StopRequest("ended"):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)  # the first once more, passed on by a sweep
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(TrainingInterrupted):
             os.kill(os.getpid(), signal.SIGINT)
 
 

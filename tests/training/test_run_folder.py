@@ -146,7 +146,7 @@ def test_an_interrupted_file_leaves_what_was_there(exclusive: bool, tmp_path: Pa
     write(b"whole")
     with pytest.raises(KeyboardInterrupt):
         write(b"half")
-    assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"whole"]
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"whole"]
     assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
 
 

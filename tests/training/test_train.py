@@ -18,14 +18,14 @@ from .conftest import TINY, TinyRun
 def form(value: Any) -> Any:
     """Return the keys and types of a nested result."""
     if isinstance(value, dict):
-        return {key: form(each) for key, each in value.items()}
+        return {key: form(entry) for key, entry in value.items()}
     return type(value).__name__
 
 
 def told(summary: dict[str, Any]) -> dict[str, Any]:
     """Return a summary without what flows that guarantee nothing cannot tell."""
     kept = {key: value for key, value in summary.items() if key != "constraints"}
-    return {key: told(each) if isinstance(each, dict) else each for key, each in kept.items()}
+    return {key: told(entry) if isinstance(entry, dict) else entry for key, entry in kept.items()}
 
 
 ENTROPIES = [

@@ -107,12 +107,12 @@ def make_state(sets: Mapping[str, ConstraintSet], dim: int = 2) -> TensorDict:
     assert region.relaxation is not None
     state = TensorDict({"observation": torch.zeros(3)}, [])
     state["constraints", "anchor"] = region.anchor
-    for k, (name, each) in enumerate(sets.items(), start=1):
+    for k, (name, constraint_set) in enumerate(sets.items(), start=1):
         state["constraints", name, "active"] = region.active[k]
         state["constraints", name, "relaxation"] = region.relaxation[k].amax(-1)
-        if each.has_rows():
+        if constraint_set.has_rows():
             state["constraints", name, "row_relaxation"] = region.relaxation[k]
-        for field, value in each.fields().items():
+        for field, value in constraint_set.fields().items():
             state["constraints", name, field] = value
     return state
 
@@ -130,7 +130,9 @@ def make_actor(
     return make_constrained_actor(
         Gaussian(loc, scale),
         spec=Bounded(-torch.ones(dim), torch.ones(dim)),
-        bijectors=[ConstraintBijector(name, type(each)) for name, each in sets.items()],
+        bijectors=[
+            ConstraintBijector(name, type(constraint_set)) for name, constraint_set in sets.items()
+        ],
         flow=flow,
     )
 

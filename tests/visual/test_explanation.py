@@ -22,7 +22,7 @@ def executing(sets: dict[str, ConstraintSet], at: list[float], flow: str = "exac
 
 
 def effects(explanation: Explanation) -> dict[str, str]:
-    return {each.name: each.effect for each in explanation.constraints}
+    return {part.name: part.effect for part in explanation.constraints}
 
 
 def only(explanation: Explanation) -> ConstraintEffect:
@@ -135,7 +135,7 @@ def test_any_dimension_and_any_number_of_constraints(
 ) -> None:
     snapshot = make_snapshot(sets, flow, dim=dim)
     explanation = explain(snapshot)
-    assert [each.name for each in explanation.constraints] == list(sets)
+    assert [part.name for part in explanation.constraints] == list(sets)
     assert len(explanation.action) == dim
     assert (explanation.share_allowed is None) == (dim > 3)
     for text in (explanation.text(), explanation.markdown()):
@@ -164,7 +164,7 @@ def test_what_the_task_says_is_passed_on() -> None:
 def test_an_action_of_another_policy_has_no_way() -> None:
     explanation = explain(replace(make_snapshot(PLANE), is_recovered=False))
     assert explanation.latent is None
-    assert all(each.before is None and each.moved is None for each in explanation.constraints)
+    assert all(part.before is None and part.moved is None for part in explanation.constraints)
     assert "the way of the action itself is unknown" in explanation.text()
 
 

@@ -18,13 +18,13 @@ BOUNDS = Box(-torch.ones(2), torch.ones(2))
 EVERY = {**PLANE, **PLANE_OF_OTHERS}
 
 
-@pytest.mark.parametrize("each", EVERY.values(), ids=EVERY)
-def test_set_outline_is_where_the_slack_is_zero(each: ConstraintSet) -> None:
-    lines = set_outline(each, VIEW)
+@pytest.mark.parametrize("constraint_set", EVERY.values(), ids=EVERY)
+def test_set_outline_is_where_the_slack_is_zero(constraint_set: ConstraintSet) -> None:
+    lines = set_outline(constraint_set, VIEW)
     points = torch.tensor(np.concatenate(lines), dtype=torch.float32)
     assert len(points) > 100
     # Linear interpolation in a cell of 2.6 / 400 rounds corners by less than a cell.
-    assert each.slack(points).abs().max() < 2.6 / 400
+    assert constraint_set.slack(points).abs().max() < 2.6 / 400
 
 
 def test_outline_of_a_ball_is_its_circle() -> None:
@@ -43,7 +43,7 @@ def test_region_outline_is_on_the_edge_of_the_region(sets: dict[str, ConstraintS
     line = torch.tensor(region_outline(region, range(len(region.sets))))
     inwards = region.anchor + (line - region.anchor) * (1 - 1e-4)
     assert region.contains(inwards).all()
-    if not any(isinstance(each, VisibleRegion) for each in sets.values()):
+    if not any(isinstance(constraint_set, VisibleRegion) for constraint_set in sets.values()):
         # A visible region is seen from the anchor: its outline may stop short of the true set.
         assert not region.contains(region.anchor + (line - region.anchor) * (1 + 1e-4)).any()
 
@@ -87,12 +87,16 @@ def region_of(sets: dict, dim: int) -> Region:
 def test_boundaries_have_no_slack(sets: dict) -> None:
     region = region_of(sets, 2)
     outlines = Outlines(region, (0, 1))
-    for k, each in enumerate(region.sets):
+    for k, constraint_set in enumerate(region.sets):
         boundary = outlines.of_set(k)
         assert boundary is not None
         near = torch.from_numpy(boundary[np.abs(boundary).max(-1) < 2])
         # A visible region is bounded by the edges of its shadows, too, where its slack is positive.
-        least = each.slack(near).abs() if not hasattr(each, "rectangles") else torch.zeros(1)
+        least = (
+            constraint_set.slack(near).abs()
+            if not hasattr(constraint_set, "rectangles")
+            else torch.zeros(1)
+        )
         assert least.max() < 1e-9
         np.testing.assert_allclose(boundary[0], boundary[-1], atol=1e-9)
 

@@ -92,8 +92,8 @@ def test_stages_are_the_flows_up_to_each(
     staged = StagedFlow(snapshot.head.flow, snapshot.region, applied)
     actions, log_dets = staged.forward(snapshot.latents)
     latents, inverse_log_dets = staged.inverse(actions[-1])
-    for k, each in enumerate(applied):
-        bijector = stage_bijector(snapshot.head.flow, snapshot.region, each)
+    for k, stage in enumerate(applied):
+        bijector = stage_bijector(snapshot.head.flow, snapshot.region, stage)
         expected = bijector.forward_and_log_det(snapshot.latents)
         torch.testing.assert_close((actions[k], log_dets[k]), expected, rtol=1e-5, atol=1e-5)
         expected = bijector.inverse_and_log_det(actions[-1])

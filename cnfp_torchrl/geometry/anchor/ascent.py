@@ -157,8 +157,8 @@ class Ascent:
         self.mean = product / len(at.room)
         # What the weighted mean of the rooms may become within the bounds.
         most = product + torch.addcmul(pull.abs(), pull, x, value=-1).sum(0)
-        for place, gain in enumerate(at.gains, len(at.room) - len(at.gains)):
-            most = torch.addcmul(most, self.weights[place], gain)
+        for row, gain in enumerate(at.gains, len(at.room) - len(at.gains)):
+            most = torch.addcmul(most, self.weights[row], gain)
         self.upper = torch.fmin(self.upper, self.level + most / total)
         return at
 
@@ -174,8 +174,8 @@ class Ascent:
         wanted_near, near = (v.unflatten(0, (2, of.dim)) for v in (wanted_near, near))
         sloped = of.slopes * near
         diagonal, cross = (of.slopes * sloped).sum(0), sloped.sum(0)
-        for place, curvature in enumerate(at.curvatures, len(room) - len(at.curvatures)):
-            diagonal = torch.addcmul(diagonal, weights[place], curvature)
+        for row, curvature in enumerate(at.curvatures, len(room) - len(at.curvatures)):
+            diagonal = torch.addcmul(diagonal, weights[row], curvature)
         corner = near.sum((0, 1)).unsqueeze(0)
         hessian = torch.diag_embed(torch.cat([diagonal, corner]).mT, dim1=0, dim2=1)
         hessian[:-1, -1] -= cross
@@ -185,8 +185,8 @@ class Ascent:
         if len(rest):
             left, factors = [rest.unsqueeze(1) * at.gradient], [at.gradient]
             first = len(room) - len(at.roots) - len(at.curvatures)
-            for place, (root, height) in enumerate(zip(at.roots, at.heights, strict=True), first):
-                left.append(root * (weights[place] / height))
+            for row, (root, height) in enumerate(zip(at.roots, at.heights, strict=True), first):
+                left.append(root * (weights[row] / height))
                 factors.append(root)
             scaled, other = (torch.cat(v) if at.roots else v[0] for v in (left, factors))
             hessian = hessian + (scaled.unsqueeze(1) * other.unsqueeze(2)).sum(0)

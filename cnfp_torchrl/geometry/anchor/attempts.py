@@ -86,11 +86,11 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
     its center, which loses :math:`\sqrt d\, s` at most by moving inwards by s in each component.
 
     Args:
-        sets: sets of batch shapes that broadcast, the first of them the box of action bounds.
-        candidate: points that may lie in all sets, ``(*batch, d)``.
+        sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.
+        candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
-    box = _bounding_box(sets)
-    low, high = box
+    bounds = bounds_of(sets)
+    low, high = box = _bounding_box(bounds, sets)
     # No point has more slack than the middle of all boxes has in the boxes.
     upper = (high - low).amin(-1) / 2
     middle = torch.lerp(low, high, 0.5)
@@ -103,12 +103,14 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
     if deepest:
         inwards = (upper * max(INWARDS, 1 / (1 + math.sqrt(box.low.shape[-1])))).unsqueeze(-1)
         wanted = deepest[0] if len(deepest) == 1 else torch.stack(deepest).mean(0)
-        points.append(torch.clamp(wanted, low + inwards, high - inwards))
+        near = torch.clamp(wanted, low + inwards, high - inwards)
+        # Half way to the middle there is often more room.
+        points += [near, torch.lerp(near, middle, 0.5)]
     if candidate is not None:
         points += [candidate, torch.lerp(candidate, middle, 0.5)]
     if not all(map(_is_described, sets)):
         points.append(torch.zeros_like(middle).clamp(low, high))
-    return _roomiest(sets, box, points, upper)
+    return _roomiest(bounds, sets, box, points, upper)
 
 
 def _is_described(constraint_set: ConstraintSet) -> bool:
@@ -118,9 +120,9 @@ def _is_described(constraint_set: ConstraintSet) -> bool:
     return described and kind.part_near is ConstraintSet.part_near
 
 
-def _bounding_box(sets: Sequence[ConstraintSet]) -> Bounds:
-    """Return bounds of all sets."""
-    box = bounds_of(sets).bounding_box()
+def _bounding_box(bounds: Box, sets: Sequence[ConstraintSet]) -> Bounds:
+    """Return bounds of the action bounds and all sets behind them."""
+    box = bounds.bounding_box()
     for constraint_set in sets[1:]:
         other = constraint_set.bounding_box()
         box = Bounds(torch.maximum(box.low, other.low), torch.minimum(box.high, other.high))
@@ -131,7 +133,8 @@ def further_attempt(sets: Sequence[ConstraintSet], before: Attempt, steps: int) 
     """Take some steps inwards from where an attempt ended."""
     ascent = Ascent(sets, before.anchor, before.upper)
     ascent.run(steps)
-    return _roomiest(sets, _bounding_box(sets), [ascent.point, before.anchor], ascent.bound)
+    bounds, points = bounds_of(sets), [ascent.point, before.anchor]
+    return _roomiest(bounds, sets, _bounding_box(bounds, sets), points, ascent.bound)
 
 
 def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
@@ -152,17 +155,21 @@ def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
 
 
 def _roomiest(
-    sets: Sequence[ConstraintSet], box: Bounds, points: Sequence[Tensor], upper: Tensor
+    bounds: Box,
+    sets: Sequence[ConstraintSet],
+    box: Bounds,
+    points: Sequence[Tensor],
+    upper: Tensor,
 ) -> Attempt:
     """Choose the points with the most slack beyond what an anchor needs.
 
     Args:
-        sets: sets of batch shapes that broadcast, the first of them the box of action bounds.
-        box: bounds of all sets, in which all slacks in boxes are at least what they are in it.
-        points: points ``(*batch, d)``.
-        upper: upper bounds of the best slack, ``(*batch,)``.
+        bounds: The action bounds.
+        sets: Sets of batch shapes that broadcast, the first of them the bounds.
+        box: The bounds of all sets, in which all slacks in boxes are at least what they are in it.
+        points: The points to choose from, ``(*batch, d)``.
+        upper: Upper bounds of the best slack, ``(*batch,)``.
     """
-    bounds = bounds_of(sets)
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
     # No box has a larger rounding error than the bounds, whose largest coordinate is theirs.
@@ -176,7 +183,7 @@ def _roomiest(
             room = torch.minimum(room, constraint_set.slack(stacked) - beyond)
     # Not by `max` and its index, as gathering takes longer than choosing between two.
     (most, *rooms), (anchor, *others) = room.nan_to_num(nan=-torch.inf).unbind(), stacked.unbind()
-    for each, point in zip(rooms, others, strict=True):
-        anchor = torch.where((each > most).unsqueeze(-1), point, anchor)
-        most = torch.maximum(most, each)
+    for room, point in zip(rooms, others, strict=True):
+        anchor = torch.where((room > most).unsqueeze(-1), point, anchor)
+        most = torch.maximum(most, room)
     return Attempt(anchor, upper, most >= 0)

@@ -11,7 +11,7 @@ _ROUNDING = 1e-12
 """The amount by which a side of the box may be missed, in mean half widths."""
 
 _APART = 1e-2
-"""The least difference to the other slacks on trial, in mean half widths.
+"""The least difference to the other maximized slacks, in mean half widths.
 
 Of slacks that are equal by chance, Newton's method finds out which can grow.
 """
@@ -20,13 +20,13 @@ Of slacks that are equal by chance, Newton's method finds out which can grow.
 def maximize_slack_over_box(problem: Program, start: Array, settled: Settled) -> Best:
     """Do what `maximize_slack` does, in closed form for the problems in which it has one.
 
-    What must hold and depends on one component alone makes a box. No slack on trial exceeds its own
-    largest one over the box; where the others are no smaller at the point that has it, and all else
-    holds there, that point is best. A ball out of reach is such a case, or a row.
+    What must hold and depends on one component alone makes a box. No maximized slack exceeds its
+    own largest one over the box; where the others are no smaller at the point that has it, and all
+    else holds there, that point is best. A ball out of reach is such a case, or a row.
 
     Args:
         problem: B problems, in which the bounds of the actions must hold.
-        start: Points strictly inside of what is not on trial, ``(B, d)``.
+        start: Points strictly inside of what is not maximized, ``(B, d)``.
         settled: The function that tells which problems need no more work.
     """
     with np.errstate(all="ignore"):
@@ -54,9 +54,9 @@ def _best_over_box(problem: Program, start: Array) -> Best:
     first, dim, batch = 2 * len(problem.reach), problem.dim, np.arange(len(start))
     rows, offsets, rates = problem.rows[first:, :dim], problem.offsets[first:], problem.rates()
     single = ((rows != 0).sum(1) == 1) & (rates[: len(rows)] == 0)
-    place = offsets[:, None] / rows
-    highs = np.where(single[:, None] & (rows > 0), place, np.inf)
-    lows = np.where(single[:, None] & (rows < 0), place, -np.inf)
+    crossing = offsets[:, None] / rows
+    highs = np.where(single[:, None] & (rows > 0), crossing, np.inf)
+    lows = np.where(single[:, None] & (rows < 0), crossing, -np.inf)
     low, high = lows.max(0), highs.min(0)
     near = (start.T - problem.middle) / problem.half
     most = [offsets - np.minimum(rows * low, rows * high).sum(1)]
@@ -64,12 +64,12 @@ def _best_over_box(problem: Program, start: Array) -> Best:
     for i, (cone, tip) in enumerate(zip(problem.cones, problem.tips, strict=True)):
         # Separable where the matrix is diagonal, as a ball's.
         slope, rest = cone[1:, :dim], cone[1:, :dim].copy()
-        each = np.arange(min(rest.shape[:2]))
-        rest[each, each] = 0
-        diagonal = slope[each, each]
-        wanted = np.where(diagonal == 0, near[each], tip[1 + each] / diagonal)
+        axes = np.arange(min(rest.shape[:2]))
+        rest[axes, axes] = 0
+        diagonal = slope[axes, axes]
+        wanted = np.where(diagonal == 0, near[axes], tip[1 + axes] / diagonal)
         nearest[i] = near
-        nearest[i, each] = np.clip(wanted, low[each], high[each])
+        nearest[i, axes] = np.clip(wanted, low[axes], high[axes])
         away = tip[1:] - (slope * nearest[i]).sum(1)
         separable = ~rest.any((0, 1))
         most.append(np.where(separable, tip[0] - np.sqrt(np.square(away).sum(0)), np.inf)[None])

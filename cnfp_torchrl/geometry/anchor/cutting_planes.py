@@ -19,7 +19,7 @@ def maximize_slack_by_cuts(
     problem: Program,
     sets: Sequence[ConstraintSet],
     required: Array,
-    trial: Flags,
+    maximized: Flags,
     counts: Flags,
     start: Array,
     settled: Settled,
@@ -34,8 +34,8 @@ def maximize_slack_by_cuts(
     Args:
         problem: B problems, without the sets.
         sets: Further sets, each of batch shape ``(B,)``, in float64 on the CPU.
-        required: Slacks that those on trial exceed by t, ``(B, len(sets))``.
-        trial: Flags of the sets on trial, ``(B, len(sets))``.
+        required: Slacks that the maximized ones exceed by t, ``(B, len(sets))``.
+        maximized: Flags of the maximized sets, ``(B, len(sets))``.
         counts: Flags of the sets that count, ``(B, len(sets))``.
         start: Points strictly inside of all that must hold, ``(B, d)``.
         settled: The function that tells which problems need no more work.
@@ -44,7 +44,7 @@ def maximize_slack_by_cuts(
     found = Best(start.copy(), np.full(batch, -np.inf), np.full(batch, np.inf))
     left = np.arange(batch)
     for _ in range(MAX_CUTS):
-        at, needs, tried, on = start[left], required[left], trial[left], counts[left]
+        at, needs, rising, on = start[left], required[left], maximized[left], counts[left]
 
         def half_settled(lower: Array, upper: Array, index: Index) -> Flags:
             """Tell where a point is well inside the rows so far."""
@@ -57,12 +57,12 @@ def maximize_slack_by_cuts(
         rooms = slacks - needs
         rooms_at_start = _slacks(sets, left, batch, at) - needs
         # Of what must hold, at least the chord to the start does.
-        outside, share = (rooms < 0) & ~tried & on, np.ones_like(rooms)
+        outside, share = (rooms < 0) & ~rising & on, np.ones_like(rooms)
         np.divide(rooms_at_start, rooms_at_start - rooms, out=share, where=outside)
         share = share.min(-1, keepdims=True)
         action = at + share * (best.action - at)
         rooms = _slacks(sets, left, batch, action) - needs
-        slack = np.where(on & tried, rooms, np.inf).min(-1)
+        slack = np.where(on & rising, rooms, np.inf).min(-1)
         slack = np.minimum(slack, problem.slack(action))
         better = slack > found.slack[left]
         found.action[left] = np.where(better[:, None], action, found.action[left])
@@ -73,7 +73,7 @@ def maximize_slack_by_cuts(
             break
         offsets = slacks - needs - (gradients * best.action[:, None]).sum(-1)
         normals = -np.moveaxis(gradients, 0, -1)
-        problem = problem.with_rows(normals, offsets.T, tried.T, on.T).select(undecided)
+        problem = problem.with_rows(normals, offsets.T, rising.T, on.T).select(undecided)
         left = left[undecided]
     return found
 

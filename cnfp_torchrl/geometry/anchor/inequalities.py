@@ -141,7 +141,7 @@ class Inequalities:
             if (value := getattr(self, name)) is not None:
                 setattr(self, name, chosen(value, keep))
         self.cones = [_Cone(*(chosen(value, keep) for value in cone)) for cone in self.cones]
-        self.sums = [_Sum(*(chosen(value, keep) for value in each)) for each in self.sums]
+        self.sums = [_Sum(*(chosen(value, keep) for value in terms)) for terms in self.sums]
 
     def bound(self) -> Tensor:
         """Return upper bounds of the smallest slack, from each slack's own range, ``(B,)``."""
@@ -189,29 +189,29 @@ class Inequalities:
         room = at.value - level
         gradients = [] if self.normals is None else [self.normals]
         roots, heights = [], []
-        place = len(room) - len(self.cones) - len(self.sums)
+        row = len(room) - len(self.cones) - len(self.sums)
         for cone, image, length in zip(self.cones, at.images, at.lengths, strict=True):
             half = (cone.size - level) / 2
             share = length / (2 * half)
-            room[place] *= 1 + share.squeeze(0)
+            room[row] *= 1 + share.squeeze(0)
             slope = (cone.matrix * image.unsqueeze(1)).sum(0) / -half
             gradients.append(torch.cat([slope, -1 - share.square()]).unsqueeze(0))
             matrix = cone.matrix.expand(-1, -1, x.shape[-1])
             roots.append(torch.cat([matrix, (image / (2 * half)).unsqueeze(1)], 1))
             heights.append(half)
-            place += 1
+            row += 1
         curvatures, gains = [], []
         for upper, lower, _ in self.sums:
             spread = (upper - lower) / 2
             term = spread * self.action(x)
             length = torch.addcmul(width.square(), term, term).sqrt()
-            room[place] -= (length - term.abs()).sum(0)
+            room[row] -= (length - term.abs()).sum(0)
             turn, rise = width / length, torch.addcmul((upper + lower) / 2, spread, term / length)
             gradient = torch.cat([-rise * self.half, rise.new_full((1, x.shape[-1]), -1.0)])
             gradients.append(gradient.unsqueeze(0))
             curvatures.append((self.half * spread * turn).square() / length)
             gains.append((width * turn).sum(0))
-            place += 1
+            row += 1
         gradient = _stacked(gradients) if gradients else room[:0, None]
         return Derivatives(room, gradient, roots, heights, curvatures, gains)
 

@@ -24,7 +24,7 @@ MAX_ITERATIONS = 60
 """The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
 
 _LARGEST = 3.0
-"""The largest weight at the start of what is not on trial, where what is has one of 1 at most."""
+"""The largest weight at the start of what is not maximized, where what is has one of 1 at most."""
 
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
@@ -40,8 +40,8 @@ class Best(NamedTuple):
         action: Actions, ``(B, d)``.
         slack: Their slacks, ``(B,)``.
         upper_bound: Upper bounds of the slack, ``(B,)``.
-        weights: Weights of sums, rows and cones in these bounds, in sum 1 for those on trial, NaN
-            where no weights were needed, ``(R, B)``; None where they are not known.
+        weights: Weights of sums, rows and cones in these bounds, in sum 1 for the maximized
+            ones, NaN where no weights were needed, ``(R, B)``; None where they are not known.
     """
 
     action: Array
@@ -64,7 +64,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
 
     Args:
         problem: B problems, with rows that bound the actions on all sides.
-        start: Points strictly inside of what is not on trial, ``(B, d)``.
+        start: Points strictly inside of what is not maximized, ``(B, d)``.
         settled: The function that tells which problems need no more work.
     """
     # Some of the problems that go on after they are settled may end in infinities.
@@ -111,8 +111,8 @@ class _Path:
         offsets: Their offsets, ``(M, B)``.
         cones: Cones of the program, ``(J, 1 + k, n, B)``.
         tips: Their constants, ``(J, 1 + k, B)``.
-        rates: 1 for rows and cones on trial and 0 for the others, ``(M + J, B)``.
-        spare: 0 for what is on trial and infinite for the others, ``(M + J, B)``.
+        rates: 1 for maximized rows and cones and 0 for the others, ``(M + J, B)``.
+        spare: 0 for what is maximized and infinite for the others, ``(M + J, B)``.
         low: Least values of all unknowns but t, ``(n, B)``.
         high: Largest values of all unknowns but t, ``(n, B)``.
         x: Unknowns, ``(n, B)``.
@@ -158,7 +158,7 @@ class _Path:
         slack, height = path.slacks()
         weights, duals = 1 / slack, _flipped(height) / _det(height)[:, None]
         pull = (np.concatenate([weights, duals[:, 0]]) * rates).sum(0)
-        # What is not on trial may be nearly touched, yet matter little in the end.
+        # What is not maximized may be nearly touched, yet matter little in the end.
         most = np.where(rates > 0, np.inf, _LARGEST)
         most[: 2 * len(problem.reach)] = np.inf  # the terms of sums belong to these
         weights = np.minimum(weights, most[: len(weights)])
@@ -309,17 +309,17 @@ def _inverted(left: Array, right: Array) -> Array:
     step's.
     """
     matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
-    each = np.arange(matrix.shape[-1])
-    if len(each) > _SMALL:
+    axes = np.arange(matrix.shape[-1])
+    if len(axes) > _SMALL:
         # Rounding may have made a matrix singular.
-        matrix[:, each, each] *= 1 + 1e-14
+        matrix[:, axes, axes] *= 1 + 1e-14
         # Of problems that went on after they were settled, which no longer count.
-        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(each))
+        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(axes))
         return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
     inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
-    least = 1e-15 * inverse[each, each]
+    least = 1e-15 * inverse[axes, axes]
     # The sweep operator (Goodnight 1979), which leaves the negative inverse.
-    for k in range(len(each)):
+    for k in range(len(axes)):
         # Where rounding made a matrix indefinite, t still grows along the direction.
         pivot = np.maximum(inverse[k, k], least[k])
         column = inverse[k].copy()

@@ -127,28 +127,28 @@ class Intersection:
         return type(self)(sets, self.widths, program, self.described, self.own, self.plain)
 
     def maximize(
-        self, required: Array, trial: Flags, counts: Flags, start: Array, settled: Settled
+        self, required: Array, maximized: Flags, counts: Flags, start: Array, settled: Settled
     ) -> Best:
-        """Find the largest t by which the slacks of rows on trial exceed what is required of them.
+        """Find the largest t by which the slacks of maximized rows exceed what is required of them.
 
         Args:
             required: Slacks of all rows, ``(B, R)``.
-            trial: The mask of rows on trial, ``(B, R)``; all others must have what is required, and
-                do at the start.
+            maximized: The mask of these rows, ``(B, R)``; all others must have what is required,
+                and do at the start.
             counts: Which rows count at all, ``(B, R)``.
-            start: Points strictly inside of what the rows not on trial require, ``(B, d)``.
+            start: Points strictly inside of what the other rows require, ``(B, d)``.
             settled: The function that tells which problems need no more work.
         """
         at = self.described
-        problem = self.program.requiring(required[:, at].T, trial[:, at].T, counts[:, at].T)
+        problem = self.program.requiring(required[:, at].T, maximized[:, at].T, counts[:, at].T)
         if not self.plain:
-            over_box = not trial[:, self.rows_of(0)].any()
+            over_box = not maximized[:, self.rows_of(0)].any()
             solve = maximize_slack_over_box if over_box else maximize_slack
             return solve(problem, start, settled)
         sets = [self.sets[i] for i in self.plain]
         rows = [self.rows_of(i).start for i in self.plain]
         return maximize_slack_by_cuts(
-            problem, sets, required[:, rows], trial[:, rows], counts[:, rows], start, settled
+            problem, sets, required[:, rows], maximized[:, rows], counts[:, rows], start, settled
         )
 
 

@@ -117,12 +117,12 @@ class Program:
             tips[i, 0] = batch_last(cone.size, batch, 0) / rate
         return cls(stacked, offsets, loose, stacked_cones, tips, middle, half, unit, reach)
 
-    def requiring(self, required: Array, trial: Flags, counts: Flags) -> Self:
+    def requiring(self, required: Array, maximized: Flags, counts: Flags) -> Self:
         """Return the problems "maximize t such that all slacks exceed what is required by t".
 
         Args:
             required: Slacks ``(R, B)`` required of all sums, rows and cones, in this order.
-            trial: Flags of those that exceed it by t, ``(R, B)``; the others need no more than it.
+            maximized: Flags of those that exceed it by t, ``(R, B)``; the others just have it.
             counts: Flags of those that count at all, ``(R, B)``.
         """
         first, dim, needs = len(self.reach) * 2, self.dim, required / self.unit
@@ -132,10 +132,10 @@ class Program:
         # Sums keep the terms, which nothing else bounds.
         sums = first // (2 * dim)
         rows[first + sums :] *= on[sums:, None]
-        rows[first:, dim] = trial[:split] & on
+        rows[first:, dim] = maximized[:split] & on
         offsets[first:] = np.where(on, offsets[first:] - needs[:split], self.loose[first:])
         cones, tips = self.cones * cone_on[:, None, None], self.tips * cone_on[:, None]
-        cones[:, 0, dim] = trial[split:] & cone_on
+        cones[:, 0, dim] = maximized[split:] & cone_on
         tips[:, 0] = np.where(cone_on, tips[:, 0] - needs[split:], 1.0)
         return replace(self, rows=rows, offsets=offsets, cones=cones, tips=tips)
 
@@ -148,18 +148,18 @@ class Program:
         """Return some of the B problems."""
         return type(self)(**{f.name: getattr(self, f.name)[..., keep] for f in fields(self)})
 
-    def with_rows(self, normals: Array, offsets: Array, trial: Flags, counts: Flags) -> Self:
+    def with_rows(self, normals: Array, offsets: Array, maximized: Flags, counts: Flags) -> Self:
         """Return the problems with rows added, where they count.
 
         Args:
             normals: Normals of the rows, ``(m, d, B)``, of slacks that are not divided further.
             offsets: Offsets of the rows, ``(m, B)``.
-            trial: Flags of the rows on trial, ``(m, B)``.
+            maximized: Flags of the maximized rows, ``(m, B)``.
             counts: Flags of the rows that count, ``(m, B)``.
         """
         rows = np.zeros((len(normals), *self.rows.shape[1:]))
         rows[:, : self.dim] = normals * (self.half / self.unit) * counts[:, None]
-        rows[:, self.dim] = trial & counts
+        rows[:, self.dim] = maximized & counts
         offsets = np.where(counts, (offsets - times(normals, self.middle)) / self.unit, 1.0)
         return replace(
             self,
@@ -201,7 +201,7 @@ class Program:
         return np.concatenate([rooms, height[:, 0] - length(height[:, 1:])])
 
     def slack(self, action: Array) -> Array:
-        """Return the smallest slack at an action of what is on trial, ``(B,)``."""
+        """Return the smallest slack at an action of what is maximized, ``(B,)``."""
         return self.slack_of(self.at(action)) * self.unit
 
     def slack_of(self, x: Array) -> Array:
@@ -209,7 +209,7 @@ class Program:
         return x[self.dim] + np.where(self.rates() > 0, self.rooms(x), np.inf).min(0)
 
     def rates(self) -> Array:
-        """Return 1 for the sums, rows and cones on trial, ``(R, B)``."""
+        """Return 1 for the maximized sums, rows and cones, ``(R, B)``."""
         rows = self.rows[2 * len(self.reach) :, self.dim]
         return np.concatenate([rows, self.cones[:, 0, self.dim]])
 

@@ -24,14 +24,14 @@ def retreat(
     r"""Move back from points of least relaxation to where there is room in all widened rows.
 
     Slacks are concave, so that on the way between two points there is no less room than linear
-    interpolation says. The weights :math:`w_j` that certified the best slack :math:`t` of the rows
-    on trial do so here, too: where rows gave way by :math:`g_j`, no point has more room in all of
-    them than :math:`(t + \sum_j w_j g_j) / \sum_j w_j`.
+    interpolation says. The weights :math:`w_j` that certified the best slack :math:`t` of the
+    maximized rows do so here, too: where rows gave way by :math:`g_j`, no point has more room in
+    all of them than :math:`(t + \sum_j w_j g_j) / \sum_j w_j`.
 
     Args:
         some: B intersections.
         best: Points of the least relaxation.
-        before: Points strictly inside of the rows that were not on trial, ``(B, d)``.
+        before: Points strictly inside of the rows that were not maximized, ``(B, d)``.
         required: Slacks that were required of the rows, ``(B, R)``.
         gain: Amounts by which the rows gave way, ``(B, R)``.
         counts: Flags of the rows that counted, ``(B, R)``.

@@ -159,36 +159,36 @@ class Search:
             some._fit(some.counts)
             self.kept[left] = some.kept
 
-    def _give_way(self, k: int, trial: Flags) -> None:
-        """Relax the rows on trial by lexicographic minimax."""
+    def _give_way(self, k: int, maximized: Flags) -> None:
+        """Relax the maximized rows by lexicographic minimax."""
         precision = PRECISION * self.depth[:, self.everything.rows_of(k)].min(-1)
-        counts, trial = self.counts.copy(), trial.copy()
+        counts, maximized = self.counts.copy(), maximized.copy()
         while True:
             required = self.depth - self.relaxation
             rooms = self.everything.row_slacks(self.kept) - required
-            left = (np.where(trial, rooms, np.inf).min(-1) < precision).nonzero()[0]
+            left = (np.where(maximized, rooms, np.inf).min(-1) < precision).nonzero()[0]
             if not len(left):
                 return
             some = self.everything.near(self.kept).select(left)
-            wanted, tried, needs = precision[left], trial[left], required[left]
+            wanted, rising, needs = precision[left], maximized[left], required[left]
 
             def settled(lower: Array, upper: Array, index: Index) -> Flags:
                 near = wanted[index]  # noqa: B023 - called before it changes
                 return (lower >= near) | (upper - lower <= near)
 
-            on = counts[left] | tried
-            best = some.maximize(needs, tried, on, self.kept[left], settled)
+            on = counts[left] | rising
+            best = some.maximize(needs, rising, on, self.kept[left], settled)
             rooms = some.row_slacks(best.action) - needs
-            least = np.where(tried, rooms, np.inf).min(-1)
+            least = np.where(rising, rooms, np.inf).min(-1)
             gives = least <= wanted / 4
-            binding = tried & (rooms <= (least + 5 * wanted)[:, None]) & gives[:, None]
+            binding = rising & (rooms <= (least + 5 * wanted)[:, None]) & gives[:, None]
             given = np.where(binding, (self.leeway[left] - least)[:, None], self.relaxation[left])
-            trial[left] = tried & ~binding & gives[:, None]
+            maximized[left] = rising & ~binding & gives[:, None]
             counts[left] = counts[left] | binding
             # Newton's method is slow to leave the boundaries that the best point lies on.
             gain = given - self.relaxation[left]
             self.relaxation[left] = given
-            sure = on & ~trial[left]
+            sure = on & ~maximized[left]
             self.kept[left], upper = retreat(some, best, self.kept[left], needs, gain, on, sure)
             self.upper[left] = np.where(gives, upper, self.upper[left])
 

@@ -77,7 +77,7 @@ def _background(layout: Layout, size: int) -> Image.Image:
 
 
 class _Canvas:
-    """Draws in arena units on an oversized picture; the map above, the battery bar below."""
+    """Draw in arena units on an oversized picture; the map above, the battery bar below."""
 
     def __init__(self, layout: Layout, size: int, image: Image.Image) -> None:
         from PIL import ImageDraw

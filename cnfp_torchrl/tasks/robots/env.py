@@ -75,7 +75,7 @@ class RobotEnv(EnvBase):
         """Return what this task shows of itself: how to put robots into chosen states."""
         return RobotView()
 
-    def place(self, states: TensorDictBase) -> TensorDict:
+    def set_states(self, states: TensorDictBase) -> TensorDict:
         """Put the robots into states and return what is then observed.
 
         Args:
@@ -182,7 +182,7 @@ class RobotView(TaskView):
     def state_setter(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
         """Put a `RobotEnv` into states, the motors' last actions included."""
         assert isinstance(env, RobotEnv)
-        return env.place(states)
+        return env.set_states(states)
 
 
 def robot_with_previous_action(

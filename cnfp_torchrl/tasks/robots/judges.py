@@ -17,7 +17,7 @@ Vector = NDArray[np.float64]
 
 
 class Judge(Protocol):
-    """Tells whether an action violates a constraint in the state that the simulator is in."""
+    """Tell whether an action violates a constraint in the state that the simulator is in."""
 
     def __call__(self, model: Any, data: Any, action: Vector) -> bool:
         """Judge an action before it is executed.

@@ -51,7 +51,7 @@ class NotStarted(Exception):
 
 
 class Follower:
-    """Copies a growing file to a viewer.
+    """Copy a growing file to a viewer.
 
     Args:
         path: The file.

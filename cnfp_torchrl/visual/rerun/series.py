@@ -71,7 +71,7 @@ def task_plots(setting: Setting) -> list[Plot]:
 
 
 class SeriesPainter:
-    """Logs the values of all plots.
+    """Log the values of all plots.
 
     Args:
         stream: The stream to log to; names and colors are logged at once.

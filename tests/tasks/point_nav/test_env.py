@@ -174,10 +174,10 @@ def test_its_state_travels() -> None:
     copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env)), PointNavEnv((3,))]
     copies[2].load_state_dict(env.state_dict())
 
-    def future(each: PointNavEnv) -> torch.Tensor:
+    def future(env: PointNavEnv) -> torch.Tensor:
         torch.manual_seed(2)
-        state = each.rand_step()["next"]
-        return torch.cat([state["observation"], each.reset()["observation"]])
+        state = env.rand_step()["next"]
+        return torch.cat([state["observation"], env.reset()["observation"]])
 
     expected = future(env)
     for twin in copies:

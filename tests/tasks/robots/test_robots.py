@@ -114,7 +114,7 @@ def test_chosen_states_are_shown_and_judged() -> None:
     )
     robots = env.base_env
     assert isinstance(robots, RobotEnv)
-    shown = robots.place(states)
+    shown = robots.set_states(states)
     assert (shown["qvel"] == 5).all()
     assert (shown["observation"][:, 8:] == 5).all()
     action = torch.full((2, 6), math.nextafter(2 / 3, 1))
@@ -129,7 +129,7 @@ def test_a_clipped_observation_does_not_loosen_the_limit() -> None:
     states = TensorDict(
         {"qpos": torch.zeros(1, 6).double(), "qvel": torch.full((1, 6), 40.0).double()}, [1]
     )
-    shown = env.transform._reset(states.empty(), env.base_env.place(states))
+    shown = env.transform._reset(states.empty(), env.base_env.set_states(states))
     assert shown["observation"].max() == 10
     assert (shown["constraints", "power", "weights"] == 40).all()
 

@@ -66,7 +66,7 @@ def test_every_curve_is_drawn_as_logged(metrics: Path) -> None:
     figure = learning_curves(read_scalars(metrics), title="a title")
     drawn = [line.get_ydata() for axes in figure.axes for line in axes.lines]
     for name, values in LOGGED.items():
-        found = any(np.array_equal(values, each) for each in drawn)
+        found = any(np.array_equal(values, line) for line in drawn)
         assert found == (name != "train/steps_per_second"), name
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[:2] == ["mean return of an episode", "violations in training (steps)"]

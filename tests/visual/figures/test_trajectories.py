@@ -45,7 +45,9 @@ def test_goals_that_were_replaced_were_reached() -> None:
 
 def test_line_follows_the_agent_and_shows_the_battery() -> None:
     axes = trajectories(VIEW, [episode()], NAMES).axes[0]
-    (line,) = (each for each in axes.collections if isinstance(each, LineCollection))
+    (line,) = (
+        collection for collection in axes.collections if isinstance(collection, LineCollection)
+    )
     way = episode().positions
     for k, segment in enumerate(line.get_segments()):
         np.testing.assert_allclose(segment, way[k : k + 2])
@@ -86,9 +88,9 @@ def test_any_layout(layout: Layout) -> None:
     )
     episodes = record_episodes(env, policy)
     assert len(episodes) == 4
-    for each in episodes:
-        assert each.positions.shape == (9, 2)
-        moves = np.diff(each.positions, axis=0)
+    for episode in episodes:
+        assert episode.positions.shape == (9, 2)
+        moves = np.diff(episode.positions, axis=0)
         assert (moves <= layout.step_length + 1e-6).all()
         assert (moves[0] > 0).all()
     figure = trajectories(find_task_view(env), episodes, NAMES)

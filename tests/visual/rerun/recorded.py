@@ -89,7 +89,7 @@ def read(
 
 
 def _is_ragged(value: list[object]) -> bool:
-    return len({len(each) for each in value if isinstance(each, list)}) > 1
+    return len({len(row) for row in value if isinstance(row, list)}) > 1
 
 
 def compare(one: Path, other: Path) -> subprocess.CompletedProcess[str]:

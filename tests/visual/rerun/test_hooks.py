@@ -58,7 +58,7 @@ def test_collector_with_a_hook(batch: list[int], agent: int, tmp_path: Path) -> 
     returns = read(path, "/series/return", "Scalars:scalars")
     reward = steps["next", "reward"].reshape(3, 4).double()
     expected = reward.cumsum(1).reshape(-1).numpy()
-    np.testing.assert_allclose([each.item() for each in returns.values()], expected)
+    np.testing.assert_allclose([value.item() for value in returns.values()], expected)
 
 
 @pytest.mark.parametrize("frames", [1, 6])
@@ -121,7 +121,7 @@ def test_environment_with_a_transform(batch: list[int], agent: int, tmp_path: Pa
         np.testing.assert_array_equal(executed[step][-1], action.numpy())
     reward = read(path, "/series/reward", "Scalars:scalars")
     np.testing.assert_allclose(
-        [each.item() for each in reward.values()], steps["next", "reward"].squeeze(-1).numpy()
+        [value.item() for value in reward.values()], steps["next", "reward"].squeeze(-1).numpy()
     )
 
 

@@ -326,46 +326,49 @@ def test_the_web_viewer_is_served_on_loopback_alone(tmp_path: Path) -> None:
 SCRIPT = """
 import os, signal, sys, psutil, rerun as rr
 from cnfp_torchrl.visual.rerun import RunningViewer, WebViewer, open_recording
-path, port, server, web_port, end = sys.argv[1], *map(int, sys.argv[2:5]), sys.argv[5]
-viewer = WebViewer(web_port, port)
-if server:
-    viewer = RunningViewer(f"rerun+http://127.0.0.1:{port}/proxy")
-recording = open_recording(path, viewer=viewer)
-if server:
-    os.kill(server, signal.SIGSTOP)
-    while psutil.Process(server).status() != psutil.STATUS_STOPPED:
-        pass
-for step in range(500):
-    recording.stream.set_time("env_step", sequence=step)
-    recording.stream.log("x", rr.Scalars(step))
-    recording.stream.log("ballast", rr.TextDocument("x" * 1000))
+folder, connected, server, served, web_port = sys.argv[1], *map(int, sys.argv[2:6])
+viewers = {
+    "connected": RunningViewer(f"rerun+http://127.0.0.1:{connected}/proxy"),
+    "served": WebViewer(web_port, served),
+}
+recordings = [
+    open_recording(f"{folder}/{name}.rrd", viewer=viewer) for name, viewer in viewers.items()
+]
+os.kill(server, signal.SIGSTOP)
+while psutil.Process(server).status() != psutil.STATUS_STOPPED:
+    pass
+for recording in recordings:
+    for step in range(500):
+        recording.stream.set_time("env_step", sequence=step)
+        recording.stream.log("x", rr.Scalars(step))
+        recording.stream.log("ballast", rr.TextDocument("x" * 1000))
 print(*(child.pid for child in psutil.Process().children(recursive=True)), flush=True)
-if end == "killed":
+if sys.argv[6] == "killed":
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 @pytest.mark.parametrize("end", ["killed", "forgotten"])
-@pytest.mark.parametrize("mode", ["connect to a stopped viewer", "serve"])
 def test_a_run_that_ends_without_closing_leaves_nothing_behind(
-    mode: str, end: str, port: int, tmp_path: Path
+    end: str, port: int, tmp_path: Path
 ) -> None:
-    server = server_of(port).pid if mode.startswith("connect") else 0
-    numbers = [port if server else free_port(), server, free_port()]
-    path = tmp_path / "recording.rrd"
+    """Neither beside a viewer that takes nothing any more, nor in a viewer of its own."""
     # Into files: a pipe would stay open in what the run leaves, and reading it wait for that.
     said, errors = tmp_path / "said", tmp_path / "errors"
     with said.open("w") as out, errors.open("w") as err:
-        command = [sys.executable, "-c", SCRIPT, path, *map(str, numbers), end]
+        numbers = map(str, (port, server_of(port).pid, free_port(), free_port()))
+        command = [sys.executable, "-c", SCRIPT, tmp_path, *numbers, end]
         done = subprocess.run(command, stdout=out, stderr=err, check=False)
     expected = 0 if end == "forgotten" else -signal.SIGKILL
     assert done.returncode == expected, errors.read_text()
     started = [int(number) for number in said.read_text().split()]
-    assert len(started) == (2 if server else 3)
+    # Two helpers that write and follow for the first, and the viewer besides for the second.
+    assert len(started) == 2 + 3
     found = [psutil.Process(number) for number in started if psutil.pid_exists(number)]
     until(lambda: not any(map(is_alive, found)))
     if end == "forgotten":
-        assert logged(path) == list(range(500))
+        for name in ("connected", "served"):
+            assert logged(tmp_path / f"{name}.rrd") == list(range(500))
 
 
 @needs_vulkan
@@ -381,7 +384,7 @@ def test_a_window_shows_the_recording_and_stays(
 
     def last() -> list[int]:
         state = ViewerClient.connect(url(number)).get_state()
-        return [t.end for each in state.recordings for t in each.timelines]
+        return [t.end for recording in state.recordings for t in recording.timelines]
 
     try:
         # More than a portion, so that some of it is shown before the end.

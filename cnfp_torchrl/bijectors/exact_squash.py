@@ -196,7 +196,7 @@ class _Retraction:
         """Return 1 for positive components and 0 for others, without a gradient.
 
         With these weights `torch.lerp` selects exactly, and in a tenth of the time of `torch.where`
-        at large batches, whose every branch is a guess of the processor. In the dtype of the sets,
+        at large batches, where the processor cannot predict the branches. In the dtype of the sets,
         which may be coarser than that of latents.
         """
         return offset.detach().sign().relu().to(self._anchor.dtype)
