@@ -77,7 +77,8 @@ def report(manifest: dict[str, Any], output: Path) -> str:
         f"certified {test['certified']} of {test['states']} states "
         f"({test['certified'] / test['states']:.2%}), {test['violations']} violations in them\n"
         f"largest difference from eager mode {test['largest_difference']:.1e}, otherwise certified "
-        f"{test['certified_otherwise_in_eager']}\n"
+        f"{test['certified_otherwise_in_eager']}; of eager mode where observations change in the "
+        f"last bit {test['largest_change_in_the_last_bit']:.1e}\n"
         f"one state: {times}\n{output / manifest['file']}\n"
     )
 

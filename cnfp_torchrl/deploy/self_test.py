@@ -59,7 +59,8 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
         Counts: ``states``, ``certified``, ``violations`` (certified actions outside a set or the
         action bounds, with zero tolerance in float64), ``fallback_out_of_bounds``,
         ``certified_otherwise_in_eager``, and ``largest_difference`` from eager mode's actions where
-        both are certified.
+        both are certified, beside ``largest_change_in_the_last_bit``: by how much these change when
+        the inputs do in their last bit. Where sets are narrow both are large, for the same reason.
     """
     counts = dict.fromkeys(
         (
@@ -71,7 +72,7 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
         ),
         0,
     )
-    largest = 0.0
+    largest = changed = 0.0
     for inputs in zip(*(value.split(CHUNK) for value in states), strict=True):
         given = with_noise(policy, inputs)
         action, certified = run(*given)
@@ -84,6 +85,9 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
         both = certified & eager_certified
         if bool(both.any()):
             largest = max(largest, float((action - eager)[both].abs().amax()))
+            nudged, still_certified = policy(*map(_next, given))
+            if bool((both := both & still_certified).any()):
+                changed = max(changed, float((nudged - eager)[both].abs().amax()))
         for name, mask in {
             "states": torch.ones_like(certified),
             "certified": certified,
@@ -92,7 +96,16 @@ def self_test(policy: DeployedPolicy, run: Run, states: Sequence[Tensor]) -> dic
             "certified_otherwise_in_eager": certified != eager_certified,
         }.items():
             counts[name] += int(mask.sum())
-    return {**counts, "largest_difference": largest}
+    return {
+        **counts,
+        "largest_difference": largest,
+        "largest_change_in_the_last_bit": changed,
+    }
+
+
+def _next(value: Tensor) -> Tensor:
+    """Return the next larger numbers, where they are floating."""
+    return value.nextafter(value.new_full((), torch.inf)) if value.is_floating_point() else value
 
 
 def with_noise(policy: DeployedPolicy, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:

@@ -94,6 +94,7 @@ class Map:
         step_length: The length by which an action a moves the agent, ``step_length * a``; None
             where actions are no moves, so that sets of actions cannot be drawn on the map.
         goal_radius: The radius of the disc in which a goal counts as reached; None draws none.
+        names: The names of both coordinates, for the axes.
     """
 
     x: tuple[float, float]
@@ -102,6 +103,7 @@ class Map:
     shapes: tuple[Shape, ...] = ()
     step_length: float | None = None
     goal_radius: float | None = None
+    names: tuple[str, str] = ("x", "y")
 
     @property
     def center(self) -> Point:

@@ -465,8 +465,14 @@ class ConstraintSet(ABC):
         value = getattr(self, field)
         given = value.expand(bad.shape)[index] if value.ndim <= bad.ndim else value[index]
         at = f" at index {list(index)}" if index else ""
+        # Of a bound that is beyond the other one both matter.
+        beside = "".join(
+            f", {name} {other.expand(bad.shape)[index].tolist()}"
+            for name, other in self.fields().items()
+            if name != field and f" {name}" in expected and other.ndim <= bad.ndim
+        )
         raise GeometryError(
-            f"{where}, field '{field}'{at}: expected {expected}, given {given.tolist()}"
+            f"{where}, field '{field}'{at}: expected {expected}, given {given.tolist()}{beside}"
         )
 
 

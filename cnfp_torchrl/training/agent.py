@@ -176,7 +176,7 @@ def warn_of_large_observations(config: DictConfig, env: TransformedEnv) -> None:
     reach = torch.where(reach > _WITHOUT_END, 0.0, reach)
     largest = float(reach.max())
     if largest > _LARGE:
-        scale = ",".join(f"{x:.2g}" if x > 0 else "1" for x in reach.tolist())
+        scale = ",".join(f"{x:.3g}" if x > 0 else "1" for x in reach.tolist())
         warnings.warn(
             f"observations reach {largest:.3g}, and networks learn best from numbers around 1; to "
             f"scale what networks read, and not what geometries do: network.observation_scale="

@@ -230,7 +230,7 @@ def gave_way_text(report: Mapping[str, Any]) -> str:
         if count := steps[state]:
             largest = f" by up to {report['largest_relaxation']:.3g} action units"
             amount = largest if state == "relaxed" else ""
-            phrases.append(f"{state}{amount} in {100 * count / total:.2g} % of steps")
+            phrases.append(f"{state}{amount} in {100 * count / total:.3g} % of steps")
     if phrases or any(broken.values()):
         counts = ", ".join(f"{count} while {state}" for state, count in broken.items())
         phrases.append(f"violations: {counts or NOT_COUNTED}")

@@ -2,13 +2,14 @@
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import ObservationNorm, TransformedEnv
 
 from cnfp_torchrl import constrain_env
 from cnfp_torchrl.deploy import DeployedPolicy, observed_states, self_test
-from cnfp_torchrl.envs import constraint_bijectors
-from cnfp_torchrl.geometry import attempt_anchor
+from cnfp_torchrl.envs import GeometryTransform, constraint_bijectors
+from cnfp_torchrl.geometry import HalfSpaces, attempt_anchor
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
 from cnfp_torchrl.training.networks import gaussian_network
@@ -123,3 +124,23 @@ def test_transforms_before_the_geometries_are_part_of_the_environment() -> None:
     base = TransformedEnv(PointNavEnv([4]), ObservationNorm(0.0, 1.0, in_keys=["observation"]))
     env = constrain_env(base, BatteryGeometry(), ObstacleGeometry())
     assert DeployedPolicy(actor_for(env), env).input_keys == ["observation"]
+
+
+@pytest.mark.parametrize(("width", "least", "most"), [(1.0, 0.0, 1e-5), (1e-3, 2e-5, 1e-2)])
+def test_the_self_test_tells_what_rounding_does_in_a_narrow_set(
+    width: float, least: float, most: float
+) -> None:
+    class Band(GeometryTransform):
+        def constraint_set(self, tensordict: TensorDictBase) -> HalfSpaces:
+            middle = tensordict["observation"][..., :1] / 2
+            normals = torch.tensor([[1.0, 1.0], [-1.0, -1.0]]).expand(*middle.shape[:-1], 2, 2)
+            return HalfSpaces(normals, torch.cat([middle, -middle], -1) + width)
+
+    env = constrain_env(PointNavEnv([8]), Band("band"))
+    actor = actor_for(env)
+    policy = DeployedPolicy(actor, env, stochastic=True)
+    states = observed_states(policy, env, actor, 500)
+    found = self_test(policy, policy, states)
+    assert found["certified"] == 500
+    assert found["largest_difference"] == 0
+    assert least < found["largest_change_in_the_last_bit"] < most

@@ -196,3 +196,8 @@ def test_a_family_must_state_its_event_dims(event_dims: dict[str, int] | None) -
         Disc.event_dims = event_dims
     with pytest.raises(GeometryError, match=r"Disc: expected event_dims with .*'center', 'radius'"):
         Disc(t(0.0, 0.0), torch.tensor(1.0))
+
+
+def test_of_ends_that_are_the_wrong_way_round_both_are_told() -> None:
+    with pytest.raises(GeometryError, match=r"'low' at index \[1\]: .*given 2\.0, high -1\.0$"):
+        Box(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))

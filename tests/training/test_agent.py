@@ -102,7 +102,7 @@ def test_large_observations_are_warned_of_unless_they_are_scaled() -> None:
     warn_of_large_observations(given, TransformedEnv(GymEnv("CartPole-v1")))  # without ends
     env = TransformedEnv(GymEnv("Acrobot-v1"))
     with pytest.warns(
-        UserWarning, match=r"reach 28.3.*network\.observation_scale=\[1,1,1,1,13,28\]"
+        UserWarning, match=r"reach 28.3.*network\.observation_scale=\[1,1,1,1,12.6,28.3\]"
     ):
         warn_of_large_observations(given, env)
     given.network.observation_scale = [1, 1, 1, 1, 13, 28]

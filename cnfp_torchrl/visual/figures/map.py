@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
-from cnfp_torchrl.envs import Boxes, Discs, Map, Marks, Polyline, TaskView
+from cnfp_torchrl.envs import Boxes, Component, Discs, Map, Marks, Polyline, TaskView
 from cnfp_torchrl.visual.colors import GOAL, INK
 from cnfp_torchrl.visual.scene import Scene
 
@@ -67,13 +67,13 @@ def draw_map(axes: Axes, plane: Map, *, labels: bool = True) -> None:
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     if labels:
-        axes.set_xlabel(axis_label("x", plane))
-        axes.set_ylabel(axis_label("y", plane))
+        axes.set_xlabel(axis_label(plane, 0))
+        axes.set_ylabel(axis_label(plane, 1))
 
 
-def axis_label(name: str, plane: Map) -> str:
+def axis_label(plane: Map, axis: int) -> str:
     """Return what an axis of a map is called."""
-    return f"{name} ({plane.unit})" if plane.unit else name
+    return Component(plane.names[axis], plane.unit).title
 
 
 def draw_moves(axes: Axes, scene: Scene, colors: Mapping[str, str]) -> None:

@@ -132,9 +132,9 @@ def trajectories(
             panels.append(axes)
             draw_map(axes, plane, labels=False)
             if i % columns == 0:
-                axes.set_ylabel(axis_label("y", plane))
+                axes.set_ylabel(axis_label(plane, 1))
             if i + columns >= len(episodes):
-                axes.set_xlabel(axis_label("x", plane))
+                axes.set_xlabel(axis_label(plane, 0))
             line = _draw_episode(axes, episode, scale)
             counted = _draw_violations(axes, episode, constraint_names, colors)
             axes.set_title(_title(episode, counted))

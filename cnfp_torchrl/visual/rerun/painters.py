@@ -272,7 +272,7 @@ class MapPainter:
         self._entities.style("", rr.Transform3D(translation=middle, scale=[1 / half, -1 / half, 1]))
         titles = [
             axis_title(Component(name, self._map.unit), limits)
-            for name, limits in (("x", self._map.x), ("y", self._map.y))
+            for name, limits in zip(self._map.names, (self._map.x, self._map.y), strict=True)
         ]
         above = self._map.y[1] + axis_room(1) * half
         _log_axes(self._entities, titles, [(x, self._map.y[0]), (x, above)])

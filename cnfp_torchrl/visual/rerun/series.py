@@ -159,6 +159,8 @@ def _styled(plot: Plot) -> dict[str, Mapping[str, style.Color]]:
 def _component_plot(name: str, title: str, components: Sequence[Component]) -> Plot:
     colors = curve_colors(len(components))
     names = [component.title for component in components]
+    if len(names) == 1:
+        title += f": {names[0]}"  # a single curve has no legend
     return Plot(name, title, dict(zip(names, colors, strict=True)))
 
 

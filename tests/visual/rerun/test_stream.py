@@ -15,6 +15,7 @@ from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, Poin
 from cnfp_torchrl.visual.explanation import explain
 from cnfp_torchrl.visual.replay import replay_step
 from cnfp_torchrl.visual.rerun import FlowStream, open_recording
+from cnfp_torchrl.visual.rerun.series import task_plots
 from cnfp_torchrl.visual.setting import Setting
 from tests.visual.cases import (
     CONFLICT,
@@ -307,3 +308,11 @@ def test_a_picture_is_streamed_where_a_step_has_one(tmp_path: Path) -> None:
     pictures = read(recording.path, "/picture", "EncodedImage:blob", "episode_0")
     assert sorted(pictures) == [0, 2]
     assert not read(recording.path, "/series/reward", "Scalars:scalars").keys() - {-1}
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_a_single_component_is_named_by_its_plots_title(dim: int) -> None:
+    plots = task_plots(Setting.of(make_snapshot({}, dim=dim).head))
+    (action,) = (plot for plot in plots if plot.name == "action")
+    assert ("a1" in action.title) == (dim == 1)
+    assert set(action.curves) == {f"a{i + 1}" for i in range(dim)}
