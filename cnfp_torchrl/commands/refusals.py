@@ -70,8 +70,8 @@ def refusal(error: BaseException) -> str | None:
     """Return the words of an error that says what the user may do, or None for any other error.
 
     Such are the errors that a raise statement of this package raised, those of the operating system
-    about a file, those of Hydra and OmegaConf for a configuration that cannot be composed, and a
-    target that cannot be built, of which Hydra hides the cause.
+    about a file and what is raised from them, those of Hydra and OmegaConf for a configuration that
+    cannot be composed, and a target that cannot be built, of which Hydra hides the cause.
     """
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: expected a value, given none; add {error.full_key}=..."
@@ -90,8 +90,10 @@ def refusal(error: BaseException) -> str | None:
         return str(error)
     if _raised_by_this_package(error):
         return _words(error)
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+    # Python's logging names its own part alone, and Hydra's log file is the first that is opened.
+    cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+    if isinstance(cause, OSError) and cause.filename is not None:
+        return f"{cause.filename}: {cause.strerror}"
     return None
 
 

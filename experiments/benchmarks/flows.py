@@ -24,11 +24,10 @@ from statistics import median
 from typing import Any
 
 import torch
-from interleaved import versions
+from interleaved import rounds, versions
 from torch import Tensor
 from torch.distributions import Independent, Normal
 from torch.func import jacrev, vmap
-from torch.utils.benchmark import Timer
 from torchrl.modules import TanhNormal
 
 from cnfp_torchrl.bijectors import ExactSquash, RadialSquash
@@ -160,22 +159,9 @@ def cvxpy_projection(p: Problem) -> Callable[[], Sample]:
     return lambda: (layer(tanh_normal(p).rsample_and_log_prob()[0], *values)[0],)
 
 
-def milliseconds(calls: dict[str, Callable[[], Any]], seconds: float) -> dict[str, list[float]]:
-    """Return the time of each call in each of several rounds.
-
-    In a round all calls take their turn, so that another program's load falls on all of them.
-    """
-    timers = {name: Timer("call()", globals={"call": call}) for name, call in calls.items()}
-    single = {name: timer.timeit(3).mean for name, timer in timers.items()}
-    count = {name: max(1, round(seconds / ROUNDS / time)) for name, time in single.items()}
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, timer in timers.items():
-            times[name].append(timer.timeit(count[name]).mean * 1e3)
-    return times
-
-
-def measure(batch: int, dim: int, constraints: int, *, quick: bool) -> dict[str, Any]:
+def measure(
+    batch: int, dim: int, constraints: int, *, quick: bool = False, eager: bool = False
+) -> dict[str, Any]:
     """Return forward and forward-plus-backward times of each method on one problem."""
     p = Problem.random(batch, dim, constraints)
     tanh, exact = tanh_normal(p), exact_flow(p)
@@ -188,22 +174,25 @@ def measure(batch: int, dim: int, constraints: int, *, quick: bool) -> dict[str,
     }
     if batch * dim <= 4096:
         calls["radial, full Jacobian"] = lambda: radial_full_jacobian(p)
-    if not quick:
+    if not (quick or eager):
         for name in ("TanhNormal", "exact", "TanhNormal, constructed", "exact, constructed"):
             calls[f"{name}, compiled"] = torch.compile(calls[name])
-        if find_spec("cvxpylayers") and batch <= 256:
-            calls["cvxpylayers"] = cvxpy_projection(p)
+    if not quick and find_spec("cvxpylayers") and batch <= 256:
+        calls["cvxpylayers"] = cvxpy_projection(p)
 
     def with_backward(call: Callable[[], Sample]) -> Callable[[], None]:
         return lambda: torch.stack([part.sum() for part in call()]).sum().backward()
 
     row: dict[str, Any] = {"batch": batch, "dim": dim, "constraints": constraints}
-    seconds = 0.02 if quick else 0.5
-    sample = milliseconds(calls, seconds)
-    backward = milliseconds({name: with_backward(call) for name, call in calls.items()}, seconds)
+    seconds = (0.02 if quick else 0.5) / ROUNDS
+    sample = rounds(calls, ROUNDS, seconds)
+    backward = rounds({n: with_backward(call) for n, call in calls.items()}, ROUNDS, seconds)
     for name in calls:
         row[name] = {
-            part: {"ms": median(times[name]), "ratio": _ratio(times[name], times[_reference(name)])}
+            part: {
+                "ms": 1e3 * median(times[name]),
+                "ratio": _ratio(times[name], times[_reference(name)]),
+            }
             for part, times in (("sample", sample), ("backward", backward))
         }
     torch.compiler.reset()
@@ -238,6 +227,7 @@ def main() -> None:
     """Measure and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="one small problem, for a test")
+    parser.add_argument("--eager", action="store_true", help="without what has to be compiled")
     parser.add_argument("--batches", type=int, nargs="+", default=[256, 4096])
     parser.add_argument("--dims", type=int, nargs="+", default=[2, 6, 32])
     parser.add_argument("--constraints", type=int, nargs="+", default=[1, 2, 8])
@@ -252,7 +242,8 @@ def main() -> None:
     for batch in batches:
         for dim in dims:
             for constraints in counts:
-                rows.append(measure(batch, dim, constraints, quick=arguments.quick))
+                how = {"quick": arguments.quick, "eager": arguments.eager}
+                rows.append(measure(batch, dim, constraints, **how))
                 print(json.dumps(rows[-1]), flush=True)
     about = {"processor": platform.machine(), **versions("cvxpylayers")}
     arguments.output.mkdir(parents=True, exist_ok=True)
@@ -267,7 +258,8 @@ def main() -> None:
             f"One thread, {about}.",
             "",
             "Compared with a TanhNormal that is constructed and compiled alike: once, or anew at "
-            "each call where it says constructed. Medians of rounds in which all take turns.",
+            "each call where it says constructed. Medians, of the process's own time on the "
+            "processor, over rounds in which all take turns.",
             "",
             "## Drawing an action and its log-density",
             "",

@@ -1,5 +1,6 @@
 """The cause of an error comes first; what nobody foresaw keeps its traceback below it."""
 
+import logging.config
 import re
 from collections.abc import Callable
 from importlib import import_module
@@ -15,6 +16,11 @@ from cnfp_torchrl.modules.constraint_bijector import in_order
 from cnfp_torchrl.training.run_folder import RunFolder
 
 Capture = pytest.CaptureFixture[str]
+
+LOG = {
+    "version": 1,
+    "handlers": {"file": {"class": "logging.FileHandler", "filename": "nowhere/train.log"}},
+}
 
 
 def written(function: Callable[[], object], capsys: Capture) -> str:
@@ -34,6 +40,7 @@ def written(function: Callable[[], object], capsys: Capture) -> str:
         (lambda: RunFolder.open("nowhere"), "nowhere"),
         (lambda: OmegaConf.create({"run": "???"}).run, "run=..."),
         (lambda: Path("nowhere/file").read_text(), "nowhere/file: No such file"),
+        (lambda: logging.config.dictConfig(LOG), "nowhere/train.log: No such file"),
         (lambda: OmegaConf.create({"a": "${gone}"}).a, r"^a: [^\n]*gone[^\n]*$"),
         (lambda: OmegaConf.create({"a": {"b": "${oc.dict.keys:c.d}"}}).a.b, r"^a\.b: [^\n]*c\.d"),
         (lambda: OmegaConf.create({"a": "${b}", "b": "???"}).a, "^a: "),
@@ -43,6 +50,7 @@ def written(function: Callable[[], object], capsys: Capture) -> str:
         "TypeError",
         "OSError",
         "file",
+        "log",
         "missing",
         "gone",
         "section gone",

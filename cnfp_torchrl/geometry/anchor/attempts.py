@@ -86,8 +86,8 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
     its center, which loses :math:`\sqrt d\, s` at most by moving inwards by s in each component.
 
     Args:
-        sets: sets of batch shapes that broadcast, the first of them the box of action bounds.
-        candidate: points that may lie in all sets, ``(*batch, d)``.
+        sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.
+        candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
     bounds = bounds_of(sets)
     low, high = box = _bounding_box(bounds, sets)
@@ -164,11 +164,11 @@ def _roomiest(
     """Choose the points with the most slack beyond what an anchor needs.
 
     Args:
-        bounds: action bounds.
-        sets: sets of batch shapes that broadcast, the first of them the bounds.
-        box: bounds of all sets, in which all slacks in boxes are at least what they are in it.
-        points: points ``(*batch, d)``.
-        upper: upper bounds of the best slack, ``(*batch,)``.
+        bounds: The action bounds.
+        sets: Sets of batch shapes that broadcast, the first of them the bounds.
+        box: The bounds of all sets, in which all slacks in boxes are at least what they are in it.
+        points: The points to choose from, ``(*batch, d)``.
+        upper: Upper bounds of the best slack, ``(*batch,)``.
     """
     shape = broadcast_shape(*(s.batch_shape for s in sets), *(p.shape[:-1] for p in points))
     stacked = torch.stack([point.expand(*shape, point.shape[-1]) for point in points])
