@@ -1,4 +1,4 @@
-"""What training and evaluation call while they run; what it is for, they do not know."""
+"""Callbacks of training and evaluation, such as a stream to a viewer, and their protocol."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class CallbackFactory(Protocol):
 
 
 class NoCallback:
-    """Do nothing."""
+    """A callback that does nothing."""
 
     loggers: Sequence[Logger] = ()
 

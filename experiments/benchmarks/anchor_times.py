@@ -29,6 +29,7 @@ from lines import drawn, problem
 from torch import Tensor
 
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, Region, lexicographic_anchor
+from cnfp_torchrl.text_table import markdown_table
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 SCIPY = Path(__file__).with_name("anchors.json")
@@ -202,11 +203,11 @@ def main() -> None:
 def judged(results: dict[str, Rows]) -> list[str]:
     """Return a table of what was aimed at, what was measured, and what was missed by how much."""
     projection = next((rows["qpax"]["ms"] for rows in results.values() if "qpax" in rows), None)
-    lines = ["## Aims, met and missed", "", "| what | measured | aim | |", "|---|---|---|---|"]
+    cells = [["what", "measured", "aim", ""]]
 
     def add(what: str, value: float, aim: float, unit: str) -> None:
         verdict = "met" if value <= aim else f"missed by {value / aim - 1:.0%}"
-        lines.append(f"| {what} | {value:.2f} {unit} | {aim:.2f} {unit} | {verdict} |")
+        cells.append([what, f"{value:.2f} {unit}", f"{aim:.2f} {unit}", verdict])
 
     for title, rows in results.items():
         for name, row in rows.items():
@@ -221,7 +222,7 @@ def judged(results: dict[str, Rows]) -> list[str]:
             for batch, most in MILLISECONDS.items():
                 if title.startswith(f"sets apart, batch {batch},") and name in NO_RELAXATION:
                     add(what, row["ms"], most, "ms")
-    return lines
+    return ["## Aims, met and missed", "", markdown_table(cells)]
 
 
 def _load() -> str:

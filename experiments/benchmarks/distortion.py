@@ -27,6 +27,7 @@ from cnfp_torchrl.modules import (
     RecessionFlow,
     SoftFlow,
 )
+from cnfp_torchrl.text_table import markdown_table
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 LEAST_SLOPE = 1e-4
@@ -95,19 +96,19 @@ def measure(kind: str, dim: int, divisor: float, count: int) -> dict[str, Distor
 def table(rows: list[dict[str, Any]]) -> str:
     """Return all measurements as a Markdown table."""
     head = ["set", "d", "r", "flow", "moved, median (95 %)", "smallest singular value (5 %)"]
-    lines = ["| " + " | ".join([*head, "largest (95 %)", "on the boundary"]) + " |"]
-    lines.append("|---" * (len(head) + 2) + "|")
+    cells = [[*head, "largest (95 %)", "on the boundary"]]
     for row in rows:
         moved, smallest, largest = (row[name] for name in ("moved", "smallest", "largest"))
-        cells = [
-            *(row["set"], row["dim"], f"{row['divisor']:g}", row["flow"]),
-            f"{moved['median']:.2g} ({moved['q95']:.2g})",
-            f"{smallest['median']:.2g} ({smallest['q05']:.2g})",
-            f"{largest['median']:.3g} ({largest['q95']:.3g})",
-            f"{100 * row['on_boundary']['share']:.1f} %",
-        ]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        cells.append(
+            [
+                *(row["set"], str(row["dim"]), f"{row['divisor']:g}", row["flow"]),
+                f"{moved['median']:.2g} ({moved['q95']:.2g})",
+                f"{smallest['median']:.2g} ({smallest['q05']:.2g})",
+                f"{largest['median']:.3g} ({largest['q95']:.3g})",
+                f"{100 * row['on_boundary']['share']:.1f} %",
+            ]
+        )
+    return markdown_table(cells)
 
 
 def main() -> None:

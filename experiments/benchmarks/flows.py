@@ -33,6 +33,7 @@ from torchrl.modules import TanhNormal
 from cnfp_torchrl.bijectors import ExactSquash, RadialSquash
 from cnfp_torchrl.distributions import ConstrainedFlow
 from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, Region
+from cnfp_torchrl.text_table import markdown_table
 
 ROUNDS = 11
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -211,19 +212,15 @@ def table(rows: list[dict[str, Any]], part: str) -> str:
     """Return ratios to the TanhNormal that is constructed and compiled alike, as Markdown."""
     methods = dict.fromkeys(n for row in rows for n in row if isinstance(row[n], dict))
     names = [n for n in methods if not n.startswith("TanhNormal")]
-    lines = [
-        "| batch | d | K | TanhNormal, ms | " + " | ".join(names) + " |",
-        "|" + "---|" * (4 + len(names)),
-    ]
+    lines = [["batch", "d", "K", "TanhNormal, ms", *names]]
     for row in rows:
-        cells = []
+        cells = [str(row[key]) for key in ("batch", "dim", "constraints")]
+        cells.append(f"{row['TanhNormal'][part]['ms']:.3f}")
         for name in names:
             ratio = row[name][part]["ratio"] if name in row else None
             cells.append("" if ratio is None else f"{ratio:.2f}" if ratio < 100 else f"{ratio:.0f}")
-        head = [str(row[key]) for key in ("batch", "dim", "constraints")]
-        cells = [*head, f"{row['TanhNormal'][part]['ms']:.3f}", *cells]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown_table(lines)
 
 
 def main() -> None:

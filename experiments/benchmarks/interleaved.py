@@ -17,6 +17,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from cnfp_torchrl.text_table import markdown_table
+
 ROUNDS = 7
 Call = Callable[[], object]
 Rows = dict[str, dict[str, float]]
@@ -145,11 +147,11 @@ def processor() -> str:
 def table(title: str, rows: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Return rows as the lines of a Markdown table."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    lines = [f"## {title}", "", f"| | {' | '.join(columns)} |", "|" + "---|" * (len(columns) + 1)]
-    for name, row in rows.items():
-        cells = [_number(row[column]) if column in row else "" for column in columns]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return [*lines, ""]
+    cells = [
+        [name, *(_number(row[column]) if column in row else "" for column in columns)]
+        for name, row in rows.items()
+    ]
+    return [f"## {title}", "", markdown_table([["", *columns], *cells]), ""]
 
 
 def _number(value: float) -> str:

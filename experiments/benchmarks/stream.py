@@ -34,6 +34,7 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential
 from cnfp_torchrl import constrain_env
 from cnfp_torchrl.modules import make_constrained_actor
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.visual.rerun import FlowStream, StreamHook, flow_blueprint
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -126,6 +127,16 @@ def reference() -> float:
 
 def table(rows: dict[str, dict[str, Any]], setting: dict[str, Any]) -> str:
     """Return the results as Markdown."""
+    cells = [
+        [
+            name,
+            f"{statistics.median(row['ms']):.2f}",
+            f"{min(row['ms']):.2f} to {max(row['ms']):.2f}",
+            str(GOALS_MS[name]),
+            f"{row['bytes']:.0f}",
+        ]
+        for name, row in rows.items()
+    ]
     lines = [
         "# What the stream to Rerun costs",
         "",
@@ -138,16 +149,7 @@ def table(rows: dict[str, dict[str, Any]], setting: dict[str, Any]) -> str:
         f"{setting['torch']}, Rerun {setting['rerun']}, Python {setting['python']} on "
         f"{setting['processor']}.",
         "",
-        "| | ms a step | range | goal | bytes a step |",
-        "|---|---|---|---|---|",
-    ]
-    for name, row in rows.items():
-        low, high = min(row["ms"]), max(row["ms"])
-        lines.append(
-            f"| {name} | {statistics.median(row['ms']):.2f} | {low:.2f} to {high:.2f} | "
-            f"{GOALS_MS[name]} | {row['bytes']:.0f} |"
-        )
-    lines += [
+        markdown_table([["", "ms a step", "range", "goal", "bytes a step"], *cells]),
         "",
         f"Without a stream, Rerun is imported: {setting['imported_when_off']}. On a busy machine a "
         f"step costs more: the load was {setting['load']:.1f} on {setting['processors']} "

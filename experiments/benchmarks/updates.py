@@ -39,6 +39,7 @@ from torch import Tensor
 
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.tasks.point_nav import POINT_NAV_ID
+from cnfp_torchrl.text_table import markdown_table
 from cnfp_torchrl.training.agent import build_actor, build_environment, build_loss
 from cnfp_torchrl.training.run_folder import RunFolder
 from cnfp_torchrl.training.storage import prepare_buffer
@@ -228,13 +229,13 @@ def summary(measured: Rounds) -> dict[str, dict[str, float]]:
     return rows
 
 
-def table(rows: dict[str, dict[str, float]], unit: str) -> list[str]:
+def table(rows: dict[str, dict[str, float]], unit: str) -> str:
     """Return the rows of one width as a Markdown table."""
-    lines = [f"| | {unit} | / {REFERENCE} | quartiles |", "|---|---|---|---|"]
+    cells = [["", unit, f"/ {REFERENCE}", "quartiles"]]
     for name, row in rows.items():
         spread = f"{row['low']:.2f} to {row['high']:.2f}"
-        lines.append(f"| {name} | {row['median']:.2f} | {row['ratio']:.2f} | {spread} |")
-    return lines
+        cells.append([name, f"{row['median']:.2f}", f"{row['ratio']:.2f}", spread])
+    return markdown_table(cells)
 
 
 def main() -> None:
@@ -295,7 +296,7 @@ def write(folder: Path, results: dict[str, dict[str, Any]], load: dict[str, Any]
     ]
     for title, result in results.items():
         lines += ["", f"## {title} ({result['rounds']} rounds)", ""]
-        lines += table(result["rows"], result["unit"])
+        lines.append(table(result["rows"], result["unit"]))
     (folder / "updates.md").write_text("\n".join([*lines, ""]))
 
 
