@@ -415,7 +415,7 @@ class ConstraintSet(ABC):
         dtypes = {name: getattr(value, "dtype", None) for name, value in self.fields().items()}
         for name, value in self.fields().items():
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
-                given = dtypes[name] or type(value).__name__
+                given = dtypes[name] if isinstance(value, Tensor) else type(value).__name__
                 raise GeometryError(
                     f"{where}, field '{name}': expected a float32 or float64 tensor, given "
                     f"{given}; convert it (half precision cannot hold a boundary with zero "

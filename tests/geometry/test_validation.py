@@ -201,3 +201,9 @@ def test_a_family_must_state_its_event_dims(event_dims: dict[str, int] | None) -
 def test_of_ends_that_are_the_wrong_way_round_both_are_told() -> None:
     with pytest.raises(GeometryError, match=r"'low' at index \[1\]: .*given 2\.0, high -1\.0$"):
         Box(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))
+
+
+def test_of_numbers_that_are_no_tensor_the_type_is_told() -> None:
+    numbers: Any = torch.zeros(2).numpy()
+    with pytest.raises(GeometryError, match=r"float32 or float64 tensor, given ndarray; convert"):
+        Box(numbers, torch.ones(2))
