@@ -120,13 +120,13 @@ class KinkedSumBound(ConstraintSet):
         kinks = torch.where(starts_up == ends_up, torch.inf, -anchor / direction)
         turn = after - before
         kinks, turn, anchor_, direction_ = torch.broadcast_tensors(kinks, turn, anchor, direction)
-        ordered, order = kinks.sort(-1)
+        order = kinks.argsort(-1)
         slopes = _running(before * direction, (turn * direction_).gather(-1, order))
         intercepts = _running(before * anchor, (turn * anchor_).gather(-1, order))
         last = (slopes / (self.bound.unsqueeze(-1) - intercepts)).argmax(-1, keepdim=True)
-        # Kinks are positive: before the first one, none has been passed.
-        ordered = torch.cat([torch.full_like(ordered[..., :1], -1.0), ordered], -1)
-        return torch.where(kinks <= ordered.gather(-1, last), after, before)
+        # By their order, not by comparing kinks: those that are equal up to rounding, as where
+        # terms vanish together, would all be passed, whichever of their pieces was chosen.
+        return torch.where(order.argsort(-1) < last, after, before)
 
 
 def _running(terms: Tensor, changes: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cnfp_torchrl.geometry import PositivePart, WeightedL1Ball
 from cnfp_torchrl.testing import check_constraint_set
 from tests.geometry.cases import CASES, DTYPES, Case
 
@@ -35,3 +36,26 @@ def test_gradients_in_the_fields_are_those_of_finite_differences(case: Case) -> 
         return type(case.sets)(**moved, validate_args=False).gauge(direction, case.inside)
 
     assert torch.autograd.gradcheck(gauge, logs, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("family", [WeightedL1Ball, PositivePart])
+def test_gauges_end_at_the_boundary_where_terms_vanish_together(
+    family: type[WeightedL1Ball | PositivePart],
+) -> None:
+    """On the way from a corner to a point with zeros all kinks are one, up to rounding."""
+    random = torch.Generator().manual_seed(0)
+    weights = torch.randn(2000, 32, generator=random)
+    sizes = 10 ** (-9 + 3 * torch.rand(2000, 1, generator=random))
+    anchor = sizes * torch.randn(2000, 32, generator=random)
+    anchor[:, 3] = 0.999 / weights[:, 3]
+    point = torch.zeros(2000, 32)
+    point[:, 5] = 2 / weights[:, 5]
+    sets = family(weights, torch.ones(2000))
+    gauge = sets.gauge(point - anchor, anchor)
+
+    def end(share: float) -> Tensor:
+        step = share / gauge.double().unsqueeze(-1)
+        return anchor.double() + step * (point.double() - anchor.double())
+
+    assert sets.contains(end(0.9)).all()
+    assert not sets.contains(end(1.1)).any()
