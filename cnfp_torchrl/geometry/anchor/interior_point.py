@@ -18,7 +18,15 @@ from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 
-from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program, length, times
+from cnfp_torchrl.geometry.anchor.program import (
+    START,
+    Array,
+    Flags,
+    Index,
+    Program,
+    length,
+    times,
+)
 
 MAX_ITERATIONS = 60
 """The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
@@ -29,8 +37,8 @@ _LARGEST = 3.0
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
 
-_SMALL = 8
-"""The largest number of unknowns for which elimination side by side is the fastest."""
+_SMALL, _FEW = 8, 30
+"""Up to this many unknowns, and from this many problems on, elimination side by side is faster."""
 
 
 class Best(NamedTuple):
@@ -73,12 +81,14 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
         found, largest, bound = x.copy(), np.empty(len(start)), np.empty(len(start))
         left = np.arange(len(start))
         path = _Path.begin(problem, x)
-        lower, upper, best = x[problem.dim] + 1, problem.bound(), x
+        lower, upper, best = x[problem.dim] + START, problem.bound(), x
         proof = np.zeros_like(path.rates)
         weights = np.empty_like(proof)
         for iteration in range(MAX_ITERATIONS + 1):
             scale = problem.unit[left]
             undecided = ~settled(lower * scale, upper * scale, left)
+            # Beyond rounding error a path may end in NaN, from where no step leads on.
+            undecided &= np.isfinite(path.x[problem.dim])
             count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
             if count <= len(left) // 2:
                 # Until then those that are settled go on with the others, but count no more.
@@ -310,7 +320,7 @@ def _inverted(left: Array, right: Array) -> Array:
     """
     matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
     axes = np.arange(matrix.shape[-1])
-    if len(axes) > _SMALL:
+    if len(axes) > _SMALL or len(matrix) < _FEW:
         # Rounding may have made a matrix singular.
         matrix[:, axes, axes] *= 1 + 1e-14
         # Of problems that went on after they were settled, which no longer count.
