@@ -17,8 +17,8 @@ from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.retreat import retreat
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
-SHARE = 0.45
-"""The share of the best slack that a searched anchor has."""
+SHARE = 0.35
+"""The share of the best slack that a searched anchor has, no less than attempts have."""
 
 PRECISION = 0.02
 """The largest distance of an amount from the least one, as a share of the depth."""
