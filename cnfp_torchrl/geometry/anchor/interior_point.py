@@ -333,18 +333,16 @@ def _inverted(left: Array, right: Array) -> Array:
     step's.
     """
     matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
-    axes = np.arange(matrix.shape[-1])
-    if len(axes) > _SMALL or len(matrix) < _MANY:
+    diagonal = np.einsum("bii->ib", matrix)
+    if len(diagonal) > _SMALL or len(matrix) < _MANY:
         # Rounding may have made a matrix singular.
-        matrix[:, axes, axes] *= 1 + 1e-14
-        # Of problems that went on after they were settled, which no longer count.
-        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(axes))
+        diagonal *= 1 + 1e-14
         with suppress(np.linalg.LinAlgError):
             return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
     inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
-    least = 1e-15 * inverse[axes, axes]
+    least = 1e-15 * diagonal
     # The sweep operator (Goodnight 1979), which leaves the negative inverse.
-    for k in range(len(axes)):
+    for k in range(len(diagonal)):
         # Where rounding made a matrix indefinite, t still grows along the direction.
         pivot = np.maximum(inverse[k, k], least[k])
         column = inverse[k].copy()
