@@ -13,7 +13,6 @@ bounded over the action bounds: no bound rests on convergence.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, Self, TypeAlias
 
@@ -37,9 +36,6 @@ _LARGEST = 3.0
 
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
-
-_SMALL, _MANY = 8, 64
-"""Up to this many unknowns, and from this many problems on, elimination side by side is faster."""
 
 _FEW = 8
 """The number of problems up to which it takes no longer to go on with all than with some."""
@@ -231,9 +227,13 @@ class _Path:
             point = scaling.scaled(self.duals)
             mirror = _flipped(point)
             left, right = np.concatenate([left, scaled]), np.concatenate([right, scaled])
-        inverse = _inverted(left, right)
+        matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
+        # Rounding may have made a matrix singular.
+        np.einsum("bii->bi", matrix)[...] *= 1 + 1e-14
         # First a step without centering: the less it would gain, the more centering there is.
-        move = inverse[:, self.dim]
+        pull = np.zeros_like(self.x)
+        pull[self.dim] = 1
+        move = _solved(matrix, pull)
         fall = times(self.rows, move) / slack
         limit = np.maximum(fall.max(0), 1 - fall.min(0))
         if cones:
@@ -245,14 +245,13 @@ class _Path:
         far = 1 - 1 / np.maximum(limit, 1)
         center = far * far * far * self.product / (count + cones)
         aim = center / (slack * self.weights) + fall * (fall - 1)
-        pull = -_pulled(self.rows, self.weights * aim)
+        pull -= _pulled(self.rows, self.weights * aim)
         if cones:
             wanted = _product(falls, falls - point)
             wanted[:, 0] += center
             aims = _quotient(wanted, point, mirror, scaling.det)
             pull -= _pulled(scaled, _side_by_side(aims))
-        pull[self.dim] += 1
-        move = times(inverse, pull)
+        move = _solved(matrix, pull)
         fall = times(self.rows, move) / slack
         loss = 1 - aim - fall
         ahead, along = fall.max(0), loss.max(0)
@@ -326,32 +325,16 @@ class ConeScaling(NamedTuple):
         return result / size[:, None]
 
 
-def _inverted(left: Array, right: Array) -> Array:
-    """Return the inverses ``(n, n, B)`` of products ``left^T right`` of matrices ``(m, n, B)``.
-
-    The products are symmetric and positive definite. What an inverse costs in accuracy is one
-    step's.
-    """
-    matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
-    diagonal = np.einsum("bii->ib", matrix)
-    if len(diagonal) > _SMALL or len(matrix) < _MANY:
-        # Rounding may have made a matrix singular.
-        diagonal *= 1 + 1e-14
-        with suppress(np.linalg.LinAlgError):
-            return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
-    inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
-    least = 1e-15 * diagonal
-    # The sweep operator (Goodnight 1979), which leaves the negative inverse.
-    for k in range(len(diagonal)):
-        # Where rounding made a matrix indefinite, t still grows along the direction.
-        pivot = np.maximum(inverse[k, k], least[k])
-        column = inverse[k].copy()
-        row = column / pivot
-        inverse -= column[:, None] * row
-        inverse[k] = row
-        inverse[:, k] = row
-        inverse[k, k] = -1 / pivot
-    return -inverse
+def _solved(matrix: Array, wanted: Array) -> Array:
+    """Return solutions ``(n, B)`` with matrices ``(B, n, n)``, NaN where one is singular."""
+    # Not by inverses, whose rounding error would keep bounds apart.
+    try:
+        return np.ascontiguousarray(np.linalg.solve(matrix, wanted.T[..., None])[..., 0].T)
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full_like(wanted, np.nan)
+    each = (_solved(matrix[i : i + 1], wanted[:, i : i + 1]) for i in range(len(matrix)))
+    return np.concatenate(list(each), -1)
 
 
 def _pulled(matrix: Array, weights: Array) -> Array:
