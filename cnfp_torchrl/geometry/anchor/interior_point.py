@@ -83,7 +83,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
         path = _Path.begin(problem, x)
         lower, upper, best = x[problem.dim] + START, problem.bound(), x.copy()
         proof = np.zeros_like(path.rates)
-        weights = np.empty_like(proof)
+        weights = np.zeros((len(problem.rows) + len(problem.cones), len(start)))
         undecided = np.ones(len(start), dtype=bool)
         for iteration in range(MAX_ITERATIONS + 1):
             least, above = path.bounds()
@@ -100,7 +100,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
             if not count or 2 * count <= len(left) > _FEW:
                 # Until then those that are settled go on with the others, but count no more.
                 found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
-                weights[:, left] = proof / (proof * path.rates).sum(0)
+                weights[np.ix_(path.which, left)] = proof / (proof * path.rates).sum(0)
                 if not count:
                     break
                 path, left, best = path.select(undecided), left[undecided], best[:, undecided]
@@ -127,6 +127,7 @@ class _Path:
         weights: Weights of the rows, ``(M, B)``.
         duals: Weights of the cones, ``(J, 1 + k, B)``.
         dim: The number d of components of an action, after which t stands in x.
+        which: Indices of the rows and cones among the program's, ``(M + J,)``.
         slack: Slacks of the rows at x, ``(M, B)``.
         height: Slacks of the cones at x, ``(J, 1 + k, B)``.
         product: The weighted sums of all slacks, once bounds are known, ``(B,)``.
@@ -144,6 +145,7 @@ class _Path:
     weights: Array
     duals: Array
     dim: int
+    which: Index
     slack: Array
     height: Array
     product: Array
@@ -152,24 +154,28 @@ class _Path:
     def begin(cls, problem: Program, x: Array) -> Self:
         """Return the paths from points on, with weights for which these are about the best."""
         dim = problem.dim
-        rates = np.concatenate([problem.rows[:, dim], problem.cones[:, 0, dim]])
+        # Cones take most of the time, so that those that count nowhere are left out.
+        counts = problem.cones.any((1, 2, 3))
+        cones, tips = problem.cones[counts], problem.tips[counts]
+        rates = np.concatenate([problem.rows[:, dim], cones[:, 0, dim]])
         low, high = np.zeros_like(x), np.ones_like(x)
         low[:dim], high[dim + 1 :] = -1, problem.reach
         path = cls(
             rows=problem.rows,
             offsets=problem.offsets,
-            cones=problem.cones,
-            tips=problem.tips,
+            cones=cones,
+            tips=tips,
             rates=rates,
             spare=np.where(rates > 0, 0.0, np.inf),
             low=low,
             high=high,
             x=x,
             weights=problem.offsets,
-            duals=problem.tips,
+            duals=tips,
             dim=dim,
+            which=np.concatenate([np.ones(len(problem.rows), dtype=bool), counts]).nonzero()[0],
             slack=problem.offsets,
-            height=problem.tips,
+            height=tips,
             product=problem.unit,
         )
         path.move(x)
@@ -185,8 +191,8 @@ class _Path:
 
     def select(self, keep: Flags) -> Self:
         """Return some of the B paths."""
-        values = vars(self).items()
-        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values})
+        values, same = vars(self).items(), ("dim", "which")
+        return type(self)(**{n: v if n in same else v[..., keep] for n, v in values})
 
     def move(self, x: Array) -> None:
         """Go to points."""
