@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
-from cnfp_torchrl.geometry.anchor.depth import EROSIONS, bounds_of, depth_in_boxes, row_depths
+from cnfp_torchrl.geometry.anchor.depth import EROSIONS, bounds_of, depth_in_boxes
 from cnfp_torchrl.geometry.box import Box
 from cnfp_torchrl.geometry.constraint_set import Bounds, ConstraintSet, broadcast_shape
 
@@ -140,23 +139,23 @@ def further_attempt(sets: Sequence[ConstraintSet], before: Attempt, steps: int) 
     return _roomiest(bounds, sets, _bounding_box(bounds, sets), points, ascent.bound)
 
 
-def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
+def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt, depth: Tensor) -> Attempt:
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
         sets: Sets of batch shapes that broadcast.
         before: The attempt to start from, ``(*batch,)``.
+        depth: The largest depth of an anchor in any row, ``(*batch,)``.
 
     Returns:
         The attempts in all states, side by side.
     """
-    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
-    if all(map(_is_convex, sets)) and bool((before.upper < -largest).all()):
+    if all(map(_is_convex, sets)) and bool((before.upper < -depth).all()):
         return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
         return further_attempt(sets, before, STEPS).select()
-    return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
+    return Attempt(*ascent.run_until(REFINEMENT, SHARE, depth))
 
 
 def _roomiest(

@@ -76,10 +76,10 @@ class Search:
     # Compilers would trace NumPy's arithmetic as their own.
     @classmethod
     @torch.compiler.disable
-    def of(cls, sets: Sequence[ConstraintSet], depths: Sequence[Tensor], leeway: Tensor) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet], depth: Tensor, leeway: Tensor) -> Self:
         """Return the search for sets in any dtype, on any device."""
-        numbers = (value.double().cpu().numpy() for value in (torch.cat(list(depths), -1), leeway))
-        return cls(Intersection.of(sets, [depth.shape[-1] for depth in depths]), *numbers)
+        numbers = (value.double().cpu().numpy() for value in (depth, leeway))
+        return cls(Intersection.of(sets), *numbers)
 
     @torch.compiler.disable
     def run(self, start: Tensor, upper: Tensor) -> Anchored:
