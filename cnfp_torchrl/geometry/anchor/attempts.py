@@ -116,9 +116,12 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
 
 def _is_described(constraint_set: ConstraintSet) -> bool:
     """Tell whether steps inwards see all of a set, so that they make up for a first attempt."""
-    kind = type(constraint_set)
-    described = kind.superlevel is not ConstraintSet.superlevel
-    return described and kind.part_near is ConstraintSet.part_near
+    described = type(constraint_set).superlevel is not ConstraintSet.superlevel
+    return described and _is_convex(constraint_set)
+
+
+def _is_convex(constraint_set: ConstraintSet) -> bool:
+    return type(constraint_set).part_near is ConstraintSet.part_near
 
 
 def _bounding_box(bounds: Box, sets: Sequence[ConstraintSet]) -> Bounds:
@@ -148,10 +151,12 @@ def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
     Returns:
         The attempts in all states, side by side.
     """
+    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
+    if all(map(_is_convex, sets)) and bool((before.upper < -largest).all()):
+        return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
         return further_attempt(sets, before, STEPS).select()
-    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
     return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
 
 
