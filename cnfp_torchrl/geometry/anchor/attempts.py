@@ -80,9 +80,10 @@ class Attempt(NamedTuple):
 def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Attempt:
     r"""Try the middle of all bounding boxes, a point that sets of closed form agree on, and others.
 
-    Where a ball is all there is beside boxes, the points find the best slack t up to a share of
-    :math:`1 / (1 + \sqrt d)`: no point of the boxes has more slack in the ball than the one next to
-    its center, which loses :math:`\sqrt d\, s` at most by moving inwards by s in each component.
+    Where one set of closed form, such as a ball or a half-space, is all there is beside boxes, the
+    points find the best slack t up to a share of :math:`1 / (1 + \sqrt d)`: no point of the boxes
+    has more slack in that set than its deepest one, which loses :math:`\sqrt d\, s` at most by
+    moving inwards by s in each component.
 
     Args:
         sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.

@@ -125,13 +125,14 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
         # Where these are most states, choosing them takes longer than steps in the others.
         some, part = sets, shape
         if 2 * len(left) < len(anchor):
-            some, part = [s.select(shape, left) for s in sets], left.shape
-            found = found.select(left)
+            # Not action bounds that are the same for all, of which more is known.
+            some = [s.select(shape, left) if s.batch_shape else s for s in sets]
+            part, found = left.shape, found.select(left)
         depths = [depth.expand(*part, depth.shape[-1]) for depth in row_depths(some)]
         depth = torch.cat(depths, -1)
         refined = refined_attempt(some, found.view(part), depth.amax(-1))
         depth = depth.reshape(-1, depth.shape[-1])
-        if some is sets:
+        if part is shape:
             refined, depth = refined.select(left), depth[left]
         anchor = anchor.index_copy(0, left, refined.anchor)
         hard = (~refined.decided).nonzero().squeeze(-1)
