@@ -34,7 +34,7 @@ MAX_ITERATIONS = 60
 _LARGEST = 3.0
 """The largest weight at the start of what is not maximized, where what is has one of 1 at most."""
 
-_FRACTION = 0.995
+_FRACTION = 0.98
 """The share of the way to the boundary that a step may go."""
 
 _FEW = 8
@@ -265,8 +265,8 @@ class _Path:
             falls = times(scaled, move).reshape(point.shape)
             losses = point - aims - falls
             crossing = _crossing(mirror, scaling.det, np.stack([falls, losses]))
-            limits = (sum(crossing) / scaling.det).max((0, 1))
-            ahead = along = np.maximum(limits, np.maximum(ahead, along))
+            limits = (sum(crossing) / scaling.det).max(1)
+            ahead, along = np.maximum(limits[0], ahead), np.maximum(limits[1], along)
         ahead, along = (_FRACTION / np.maximum(limit, _FRACTION) for limit in (ahead, along))
         self.weights = self.weights * (1 - along * loss)
         if cones:
