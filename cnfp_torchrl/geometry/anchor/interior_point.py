@@ -265,8 +265,9 @@ class _Path:
             falls = times(scaled, move).reshape(point.shape)
             losses = point - aims - falls
             crossing = _crossing(mirror, scaling.det, np.stack([falls, losses]))
-            limits = (sum(crossing) / scaling.det).max(1)
-            ahead, along = np.maximum(limits[0], ahead), np.maximum(limits[1], along)
+            limits = (sum(crossing) / scaling.det).max((0, 1))
+            # Steps of two lengths may go round in circles, without end.
+            ahead = along = np.maximum(limits, np.maximum(ahead, along))
         ahead, along = (_FRACTION / np.maximum(limit, _FRACTION) for limit in (ahead, along))
         self.weights = self.weights * (1 - along * loss)
         if cones:
