@@ -15,7 +15,6 @@ from cnfp_torchrl.geometry import (
     HalfSpaces,
     PositivePart,
     TaskSpaceBall,
-    VisibleOrBox,
     VisibleRegion,
     WeightedL1Ball,
 )
@@ -124,15 +123,6 @@ def _visible(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
     return VisibleRegion(position, rectangles, 0.5 * torch.ones(())), torch.zeros(*batch, d)
 
 
-def _visible_or_box(batch: tuple[int, ...], d: int) -> tuple[ConstraintSet, Tensor]:
-    region, inside = _visible(batch, d)
-    half = 0.3 + torch.rand(*batch, d)
-    in_sight = torch.randint(2, batch).float()
-    assert isinstance(region, VisibleRegion)
-    seen = region.position, region.rectangles, region.step
-    return VisibleOrBox(*seen, -half, half, in_sight), inside
-
-
 FAMILIES: dict[str, tuple[Make, tuple[int, ...]]] = {
     "box": (_box, (1, 2, 6, 32)),
     "half-box": (_half_box, (2, 6)),
@@ -148,7 +138,6 @@ FAMILIES: dict[str, tuple[Make, tuple[int, ...]]] = {
     "task-space-ball": (_task_space_ball, (1, 2, 6, 32)),
     "ball-of-components": (_ball_of_some_components, (2, 6)),
     "visible": (_visible, (1, 2, 3)),
-    "sight-or-box": (_visible_or_box, (2,)),
     "zero-rows": (_half_spaces_with_zero_rows, (2, 6)),
 }
 """By name: how they are made, and in which dimensions they are worth a look."""

@@ -25,8 +25,9 @@ def call_command(name: str, *arguments: str) -> int:
 
 def run_command(folder: Path, name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a process of its own, in a folder."""
+    module, _, function = SCRIPTS[name].partition(":")
     return subprocess.run(
-        [sys.executable, "-m", SCRIPTS[name].partition(":")[0], *arguments],
+        [sys.executable, "-c", f"from {module} import {function}; {function}()", *arguments],
         cwd=folder,
         env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,

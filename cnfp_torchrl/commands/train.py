@@ -201,17 +201,22 @@ def main() -> None:
     remember_command("cnfp-train")
     sys.argv[1:] = with_common_keys(sys.argv[1:])
     try:
-        _main()
+        try:
+            _main()
+        finally:
+            # Also after a run that failed, which is why the others are worth a look; but not where
+            # the launcher was refused before the first.
+            while STARTED:
+                _report(STARTED.pop(0))
     except TrainingInterrupted as stop:
         sys.stderr.write(f"{stop}\n")
         sys.exit(128 + stop.number)
-    finally:
-        # Also after a run that failed, which is why the others are worth a look; but not where the
-        # launcher was refused before the first.
-        for sweep in STARTED:
-            if run_folders(sweep):
-                sys.stdout.write(f"{report(sweep)}\n")
-        STARTED.clear()
+
+
+def _report(sweep: Path) -> None:
+    """Print what came of a sweep."""
+    if run_folders(sweep):
+        sys.stdout.write(f"{report(sweep)}\n")
 
 
 if __name__ == "__main__":

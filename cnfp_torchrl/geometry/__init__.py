@@ -37,7 +37,7 @@ from cnfp_torchrl.geometry.norms import length, power_of_two
 from cnfp_torchrl.geometry.projection import project, project_onto_intersection, settled
 from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
-from cnfp_torchrl.geometry.visible_region import VisibleOrBox, VisibleRegion
+from cnfp_torchrl.geometry.visible_region import VisibleRegion
 from cnfp_torchrl.geometry.weighted_sums import PositivePart, WeightedL1Ball
 
 __all__ = [
@@ -62,7 +62,6 @@ __all__ = [
     "Rows",
     "Superlevel",
     "TaskSpaceBall",
-    "VisibleOrBox",
     "VisibleRegion",
     "WeightedL1Ball",
     "are_within",

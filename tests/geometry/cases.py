@@ -15,7 +15,6 @@ from cnfp_torchrl.geometry import (
     HalfSpaces,
     PositivePart,
     TaskSpaceBall,
-    VisibleOrBox,
     VisibleRegion,
     WeightedL1Ball,
 )
@@ -53,7 +52,7 @@ class Case:
 
     @property
     def convex(self) -> bool:
-        return not isinstance(self.sets, VisibleRegion | VisibleOrBox)
+        return not isinstance(self.sets, VisibleRegion)
 
     @property
     def bounds(self) -> Box:
@@ -92,9 +91,6 @@ def _scaled(sets: ConstraintSet, size: float) -> ConstraintSet:
             return TaskSpaceBall(jacobian / size, offset, radius)
         case VisibleRegion(position, rectangles, step):
             return VisibleRegion(position, rectangles, step / size)
-        case VisibleOrBox(position, rectangles, step, low, high, in_sight):
-            step, low, high = step / size, low * size, high * size
-            return VisibleOrBox(position, rectangles, step, low, high, in_sight)
     raise TypeError(type(sets))
 
 

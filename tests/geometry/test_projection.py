@@ -21,7 +21,6 @@ from cnfp_torchrl.geometry import (
     PositivePart,
     Region,
     TaskSpaceBall,
-    VisibleOrBox,
     VisibleRegion,
     WeightedL1Ball,
     project,
@@ -306,17 +305,11 @@ def visible(count: int, rectangles: int) -> VisibleRegion:
 
 
 @pytest.mark.parametrize("rectangles", [1, 2])
-@pytest.mark.parametrize("or_box", [False, True])
-def test_the_closest_visible_point_is_that_of_a_grid(rectangles: int, or_box: bool) -> None:
+def test_the_closest_visible_point_is_that_of_a_grid(rectangles: int) -> None:
     torch.manual_seed(rectangles)
     seen = visible(20, rectangles)
-    allowed: ConstraintSet = seen
-    if or_box:
-        sees = torch.tensor([0.0, 1.0]).double().repeat(10)
-        box = cube(2, 0.3).with_fields(lambda field, _: field.expand(20, 2))
-        allowed = VisibleOrBox(**seen.fields(), **box.fields(), in_sight=sees)
     ball = Ball(torch.zeros(20, 2).double(), torch.full((20,), 1.2).double())
-    region = Region((cube(2), ball, allowed), torch.zeros(20, 2).double())
+    region = Region((cube(2), ball, seen), torch.zeros(20, 2).double())
     given = 1.5 * torch.randn(4, 20, 2).double()
     axis = torch.linspace(-1, 1, 161).double()
     grid = torch.cartesian_prod(axis, axis).unsqueeze(1)

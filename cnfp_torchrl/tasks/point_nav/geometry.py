@@ -36,13 +36,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cnfp_torchrl.envs import GeometryTransform
-from cnfp_torchrl.geometry import (
-    Ball,
-    Box,
-    GeometryError,
-    VisibleOrBox,
-    VisibleRegion,
-)
+from cnfp_torchrl.geometry import Ball, Box, GeometryError, VisibleRegion
 from cnfp_torchrl.tasks.point_nav.layout import BATTERY_FULL, Layout
 from cnfp_torchrl.tasks.point_nav.shortest_path import (
     CAUTIOUS,
@@ -154,10 +148,9 @@ class ObstacleGeometry(PointNavGeometry):
 class VisibleObstacleGeometry(PointNavGeometry):
     """All moves whose straight path touches no obstacle: not convex, and larger than a box.
 
-    Rectangles and walls are grown by `MARGIN`. Where that leaves no room around the agent, because
-    it is pressed against an obstacle, the box of `ObstacleGeometry` replaces the region: it may
-    leave out the zero action and so leads away. A visible region cannot be moved inwards: a margin
-    or a resolution is refused, by name, when the environment's specs are read.
+    Without the margin of `ObstacleGeometry`: flows keep off by what rounding may do, and lead an
+    agent that is so close away, see `VisibleRegion.eroded`. A visible region cannot be moved
+    inwards: a margin or a resolution is refused, by name, when the environment's specs are read.
     """
 
     usual_name = "obstacle"
@@ -170,25 +163,18 @@ class VisibleObstacleGeometry(PointNavGeometry):
         **kwargs: Any,
     ) -> None:
         super().__init__(layout, name, observation_key, **kwargs)
-        self._box = ObstacleGeometry(layout, name, observation_key)
-        wall = torch.full((2,), self.layout.wall - MARGIN)
-        corners = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
-        grown = corners + MARGIN * torch.tensor([[-1.0], [1.0]])
-        self.register_buffer("_obstacles", torch.cat([grown, VisibleRegion.walls(-wall, wall)]))
+        wall = torch.full((2,), self.layout.wall)
+        rectangles = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
+        self.register_buffer(
+            "_obstacles", torch.cat([rectangles, VisibleRegion.walls(-wall, wall)])
+        )
 
-    def constraint_set(self, tensordict: TensorDictBase) -> VisibleOrBox:
-        """Return the moves in sight, or the box (docs/method.md, section 4)."""
-        position, _ = self.read(tensordict)
+    def constraint_set(self, tensordict: TensorDictBase) -> VisibleRegion:
+        """Return the moves in sight (docs/method.md, section 4)."""
+        position = read_position(tensordict, self.in_keys[0])
         obstacles = self._obstacles.expand(*position.shape[:-1], *self._obstacles.shape)
         step = torch.full_like(position[..., 0], self.layout.step_length)
-        region = VisibleRegion(position, obstacles, step, validate_args=False)
-        room = region.slack(torch.zeros_like(position)) >= MARGIN / self.layout.step_length
-        return VisibleOrBox(
-            **region.fields(),
-            **self._box.constraint_set(tensordict).fields(),
-            in_sight=room.to(position.dtype),
-            validate_args=False,
-        )
+        return VisibleRegion(position, obstacles, step, validate_args=False)
 
 
 class BatteryGeometry(PointNavGeometry):
