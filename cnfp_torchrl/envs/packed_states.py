@@ -154,17 +154,19 @@ class PackedStates(Transform):
         pointers = tensordict.pop(STATE_KEY)
         root = pointers.get("root")
         rows = self._states.take(torch.stack([root, root + pointers.get("step")]))
-        parts = tensordict, tensordict.get("next")
-        pointer = _write(parts, self._blocks, rows)
-        if pointer is None:
-            return tensordict
-        if self._rare.end == 0:
-            rare = rows.new_zeros(*rows.shape[:-1], _width(self._rare_blocks))
-        else:
-            # Their numbers begin with 1; 0 stands for zeros.
-            rare = self._rare.take((pointer - 1).clamp(min=0)) * (pointer > 0).unsqueeze(-1)
-        _write(parts, self._rare_blocks, rare)
-        return tensordict
+        at_root: dict[str, Any] = {}
+        after: dict[str, Any] = {}
+        pointer = _write((at_root, after), self._blocks, rows)
+        if pointer is not None:
+            if self._rare.end == 0:
+                rare = rows.new_zeros(*rows.shape[:-1], _width(self._rare_blocks))
+            else:
+                # Their numbers begin with 1; 0 stands for zeros.
+                rare = self._rare.take((pointer - 1).clamp(min=0)) * (pointer > 0).unsqueeze(-1)
+            _write((at_root, after), self._rare_blocks, rare)
+        # Unchecked, because to set entry by entry takes ten times as long.
+        entries = _merged(tensordict, {**at_root, "next": after})
+        return TensorDict._new_unsafe(entries, tensordict.batch_size, tensordict.device)
 
     def get_extra_state(self) -> dict[str, Any]:
         return {key: self.__dict__[key] for key in _STATE}
@@ -237,43 +239,38 @@ _STATE = (
 
 
 def _write(
-    parts: Iterable[TensorDictBase], blocks: Iterable[_Block], rows: Tensor
+    trees: Iterable[dict[str, Any]], blocks: Iterable[_Block], rows: Tensor
 ) -> Tensor | None:
-    """Write the entries of states from their rows of bytes, a batch of rows for each part.
+    """Write the entries of states from their rows of bytes, a batch of rows for each nested dict.
 
     Returns the pointers to rows of rare entries instead of writing them.
     """
     pointers = []
-    for part, row in zip(parts, rows, strict=True):
-        tree: dict[str, Any] = {}
+    for tree, row in zip(trees, rows, strict=True):
         for dtype, shapes, widths, start, stop in blocks:
             values = row[:, start:stop].view(dtype).split_with_sizes(widths, -1)
             for (key, shape), value in zip(shapes.items(), values, strict=True):
                 if len(shape) != 1:
                     value = value.unflatten(-1, shape) if shape else value.squeeze(-1)
                 if key == _RARE_KEY:
-                    pointers.append(value.squeeze(-1))
+                    pointers.append(value)
                     continue
                 *path, name = (key,) if isinstance(key, str) else key
                 branch = tree
                 for step in path:
                     branch = branch.setdefault(step, {})
                 branch[name] = value
-        _graft(part, tree)
     return torch.stack(pointers) if pointers else None
 
 
-def _graft(part: TensorDictBase, tree: dict[str, Any]) -> None:
-    """Write a tree of entries, whose batch size and device are those of a tensordict, into it."""
+def _merged(known: TensorDictBase, tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of a tensordict and of a nested dict, which wins, as a nested dict."""
+    entries = dict(known.items())
     for name, branch in tree.items():
-        known = part.get(name, None) if isinstance(branch, dict) else None
-        if known is not None:
-            _graft(known, branch)
-        elif isinstance(branch, dict):
-            # Unchecked, in a tenth of the time of setting entry by entry.
-            part.set(name, TensorDict._new_unsafe(branch, part.batch_size, part.device))
-        else:
-            part.set(name, branch)
+        inner = entries.get(name)
+        is_inner = isinstance(branch, dict) and inner is not None
+        entries[name] = _merged(inner, branch) if is_inner else branch
+    return entries
 
 
 def _layout(entries: Mapping[NestedKey, Tensor]) -> list[_Block]:

@@ -103,7 +103,8 @@ class StackedPerceptron:
                 values = _rectified(values) if is_rectifier else step(values)
                 continue
             weight = weights[step.weight]
-            values = values.expand(weight.shape[0], *values.shape[-2:])
+            if values.ndim == 2:
+                values = values.expand(weight.shape[0], *values.shape)
             if step.bias is None:
                 values = torch.bmm(weight, values)
             else:

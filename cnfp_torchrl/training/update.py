@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -77,7 +79,8 @@ class Update:
             self._losses, self._to_compile = torch.compile(self.loss), False
         # Parameters without a gradient, such as the actor's in between, stay as they are.
         self.optimizer.zero_grad(set_to_none=True)
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        parts = [value for name, value in losses.items() if name.startswith("loss_")]
+        reduce(torch.add, parts).backward()
         if self._max_grad_norm is not None:
             nn.utils.clip_grad_norm_(self.loss.parameters(), self._max_grad_norm)
         self.optimizer.step()
