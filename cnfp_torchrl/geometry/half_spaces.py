@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from cnfp_torchrl.geometry.constraint_set import (
     EROSION_IN_EPS,
@@ -41,7 +40,7 @@ class HalfSpaces(ConstraintSet):
 
     event_dims: ClassVar[Mapping[str, int]] = {"normals": 2, "offsets": 1}
     finite_fields: ClassVar[frozenset[str]] = frozenset({"normals"})
-    _kept: ClassVar[Rows | None] = None  # an instance's own where it is known
+    _kept: ClassVar[_Rows | None] = None  # an instance's own where it is known
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         yield "offsets", self.offsets.isneginf(), "an offset above -inf"
@@ -60,54 +59,67 @@ class HalfSpaces(ConstraintSet):
         return frozenset({"offsets"})
 
     def contains(self, action: Tensor) -> Tensor:
-        rows = self.to(torch.float64).superlevel()
-        return (_rows(rows.normals, action.double()) <= rows.offsets).all(-1)
+        rows = self.to(torch.float64)._rows_last(action.ndim - 1)
+        return (rows.along(action.double()) <= rows.offsets).all(0)
 
     def slack(self, action: Tensor) -> Tensor:
-        return self.row_slacks(action).amin(-1)
+        return self._slacks(action).amin(0)
 
     def row_slacks(self, action: Tensor) -> Tensor:
         """Return the distances to the rows' boundaries, ``(*batch, m)``."""
-        rows = self.superlevel()
-        return (rows.offsets - _rows(rows.normals, action)) / rows.rates
+        return self._slacks(action).movedim(0, -1)
+
+    def _slacks(self, action: Tensor) -> Tensor:
+        """Return the distances to the rows' boundaries, ``(m, *batch)``."""
+        rows = self._rows_last(action.ndim - 1)
+        return (rows.offsets - rows.along(action)) / rows.rates
 
     def row_count(self) -> int:
         return self.normals.shape[-2]
 
     def inflated(self, by: Tensor) -> Self:
-        rows = self.superlevel()
-        return self._with(rows, rows.offsets + by * rows.rates)
+        rows = self._rows_last(by.ndim - 1)
+        return self._with(rows, rows.offsets + by.movedim(-1, 0) * rows.rates)
 
     def rounding(self, magnitude: Tensor | float = 1.0) -> Tensor:
-        rows = self.superlevel()
-        return (self._erosion(rows, magnitude) / rows.rates).masked_fill(rows.offsets.isinf(), 0)
+        rows, erosion = self._erosion(magnitude)
+        return (erosion / rows.rates).masked_fill(rows.offsets.isinf(), 0).movedim(0, -1)
 
     def gauge(self, direction: Tensor, anchor: Tensor) -> Tensor:
         return self.gauge_about(anchor)(direction)
 
     def gauge_about(self, anchor: Tensor) -> Gauge:
-        rows = self.superlevel()
-        room = rows.offsets - _rows(rows.normals, anchor)
-        return partial(_gauge, rows.normals, room.reciprocal())
+        rows = self._rows_last(anchor.ndim - 1)
+        room = rows.offsets - rows.along(anchor)
+        return partial(_gauge, rows._replace(offsets=room.reciprocal()))
 
     def bounding_box(self) -> Bounds:
         """Return the bounds set by rows along an axis; the others are infinite."""
-        single = (self.normals != 0).sum(-1, keepdim=True) == 1
-        bound = self.offsets.unsqueeze(-1) / self.normals
-        high = torch.where(single & (self.normals > 0), bound, torch.inf).amin(-2)
-        low = torch.where(single & (self.normals < 0), bound, -torch.inf).amax(-2)
-        return Bounds(low, high)
+        normals, offsets, _ = self._rows_last()
+        slanted = (normals != 0).sum(1) != 1
+        bound = offsets.masked_fill(slanted, torch.inf).unsqueeze(1) / normals
+        high = bound.masked_fill(normals <= 0, torch.inf).amin(0)
+        low = bound.masked_fill(normals >= 0, -torch.inf).amax(0)
+        return Bounds(low.movedim(0, -1), high.movedim(0, -1))
+
+    def deepest_within(self, box: Bounds) -> Tensor | None:
+        """Return a point of the box that is farthest inside of the row, if there is one row."""
+        if self.row_count() > 1:
+            return None
+        away = self.normals.squeeze(-2).sign()
+        return torch.lerp(box.low, box.high, (1 - away) / 2)
 
     def eroded(self, magnitude: Tensor | float = 1.0) -> Self:
-        rows = self.superlevel()
-        moved = rows.offsets - self._erosion(rows, magnitude)
+        rows, erosion = self._erosion(magnitude)
+        moved = rows.offsets - erosion
         return self._with(rows, torch.where(rows.offsets.isinf(), rows.offsets, moved))
 
-    def _erosion(self, rows: Rows, magnitude: Tensor | float) -> Tensor:
-        """Return by how much `eroded` lowers offsets, ``(*batch, m)``; infinite as they are."""
+    def _erosion(self, magnitude: Tensor | float) -> tuple[_Rows, Tensor]:
+        """Return the rows, and by how much `eroded` lowers their offsets, infinite as they are."""
         largest = torch.as_tensor(magnitude, dtype=self.dtype, device=self.normals.device)
-        size = rows.normals.abs().sum(-1) * largest.unsqueeze(-1) + rows.offsets.abs()
-        return EROSION_IN_EPS * torch.finfo(self.dtype).eps * size
+        rows = self._rows_last(largest.ndim)
+        size = rows.normals.abs().sum(1) * largest + rows.offsets.abs()
+        return rows, EROSION_IN_EPS * torch.finfo(self.dtype).eps * size
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         normals = torch.zeros_like(self.normals[..., :1, :])
@@ -120,41 +132,81 @@ class HalfSpaces(ConstraintSet):
         )
 
     def superlevel(self) -> Rows:
+        normals, offsets, rates = self._rows_last()
+        normals = normals.movedim((0, 1), (-2, -1))
+        return Rows(normals, offsets.movedim(0, -1), rates.movedim(0, -1))
+
+    def _rows_last(self, batch_dims: int = 0) -> _Rows:
+        """Return the rows in about unit length, with at least so many batch dimensions."""
         if self._kept is not None:
-            return self._kept
-        # Normals of about unit length, which do not vanish when squared. An offset out of range
-        # beside its normal becomes infinite: no action reaches that row.
-        unit = power_of_two(self.normals.abs().amax(-1))
-        normals = self.normals / unit.unsqueeze(-1)
-        lengths = vector_norm(normals, dim=-1)
-        zero = lengths == 0
-        rows = Rows(normals, self._passed(zero, self.offsets / unit), lengths.masked_fill(zero, 1))
+            return self._kept.spread(batch_dims)
+        batch_dims = max(batch_dims, self.normals.ndim - 2, self.offsets.ndim - 1)
+        normals = _spread(self.normals.movedim((-2, -1), (0, 1)), 2, batch_dims).contiguous()
+        offsets = _spread(self.offsets.movedim(-1, 0), 1, batch_dims).contiguous()
+        # Normals that do not vanish when squared. An offset out of range beside its normal becomes
+        # infinite: no action reaches that row.
+        unit = power_of_two(normals.abs().amax(1))
+        normals = normals / unit.unsqueeze(1)
+        # Not `torch.linalg.vector_norm`, which is slow along the first dimensions.
+        squares = normals.square().sum(1)
+        zero = squares == 0
+        # A normal of zero lets every action pass, or none.
+        offsets = torch.where(zero & (offsets >= 0), torch.inf, offsets / unit)
+        rows = _Rows(normals, offsets, squares.masked_fill(zero, 1).sqrt())
         # What was found without gradients must not be used with them.
         if not (self.normals.requires_grad or self.offsets.requires_grad):
             self._keep(rows)
         return rows
 
-    @staticmethod
-    def _passed(zero: Tensor, offsets: Tensor) -> Tensor:
-        """Return offsets, infinite where a normal of zero lets every action pass, not none."""
-        return torch.where(zero & (offsets >= 0), torch.inf, offsets)
-
-    def _with(self, rows: Rows, offsets: Tensor) -> Self:
+    def _with(self, rows: _Rows, offsets: Tensor) -> Self:
         """Return the set with the normals of some rows and other offsets."""
-        offsets = self._passed((rows.normals == 0).all(-1), offsets)
-        moved = type(self)(rows.normals, offsets, validate_args=False)
-        moved._keep(Rows(rows.normals, offsets, rows.rates))
+        passed = (rows.normals == 0).all(1) & (offsets >= 0)
+        rows = rows._replace(offsets=torch.where(passed, torch.inf, offsets))
+        normals = rows.normals.movedim((0, 1), (-2, -1))
+        moved = type(self)(normals, rows.offsets.movedim(0, -1), validate_args=False)
+        moved._keep(rows)
         return moved
 
-    def _keep(self, rows: Rows) -> None:
+    def _keep(self, rows: _Rows) -> None:
         # A compiler sees by itself what is computed twice.
         if not torch.compiler.is_compiling():
             object.__setattr__(self, "_kept", rows)
 
 
-def _gauge(normals: Tensor, inverse_room: Tensor, direction: Tensor) -> Tensor:
-    return (_rows(normals, direction) * inverse_room).amax(-1).relu()
+class _Rows(NamedTuple):
+    """Rows with the batch last, over which arithmetic on a few components is some times as fast.
+
+    Attributes:
+        normals: Normals, ``(m, d, *batch)``.
+        offsets: Offsets, ``(m, *batch)``.
+        rates: Lengths of the normals, 1 for a normal of zero, ``(m, *batch)``.
+    """
+
+    normals: Tensor
+    offsets: Tensor
+    rates: Tensor
+
+    def spread(self, batch_dims: int) -> _Rows:
+        """Return the rows with at least so many batch dimensions."""
+        if self.offsets.ndim > batch_dims:
+            return self
+        events = (2, 1, 1)
+        return _Rows(*(_spread(v, n, batch_dims) for v, n in zip(self, events, strict=True)))
+
+    def along(self, vector: Tensor) -> Tensor:
+        """Return the products with vectors ``(*batch, d)``, of no more dimensions than here."""
+        vector = _spread(vector.movedim(-1, 0), 1, self.offsets.ndim - 1)
+        return (self.normals * vector).sum(1)
 
 
-def _rows(normals: Tensor, vector: Tensor) -> Tensor:
-    return (normals * vector.unsqueeze(-2)).sum(-1)
+def _spread(value: Tensor, events: int, batch_dims: int) -> Tensor:
+    """Return values ``(*event, *batch)`` with at least so many batch dimensions."""
+    missing = events + batch_dims - value.ndim
+    if missing <= 0:
+        return value
+    return value.reshape(*value.shape[:events], *(1,) * missing, *value.shape[events:])
+
+
+def _gauge(rows: _Rows, direction: Tensor) -> Tensor:
+    rows = rows.spread(direction.ndim - 1)
+    return (rows.along(direction) * rows.offsets).amax(0).relu()

@@ -202,7 +202,8 @@ def test_thin_and_wide_sets_are_kept(dtype: torch.dtype) -> None:
 
 def test_a_candidate_decides_where_it_is_roomy() -> None:
     """Without steps inwards, which the middle of the boxes would need here."""
-    sets = [BOUNDS, box((-0.2, -1.0), (1.0, 1.0)), HalfSpaces(t([1.0, 1.0]), t(-0.2))]
+    rows = HalfSpaces(t([1.0, 1.0], [1.0, 0.9]), t(-0.2, 5.0))
+    sets = [BOUNDS, box((-0.2, -1.0), (1.0, 1.0)), rows]
     for candidate in (t(0.05, -0.6), t(0.0, -0.55)):
         anchor, decided = attempt_anchor(sets, candidate, steps=0)
         assert decided
@@ -210,6 +211,20 @@ def test_a_candidate_decides_where_it_is_roomy() -> None:
     for candidate in (t(0.9, 0.9), t(torch.nan, 0.0)):
         _, decided = attempt_anchor(sets, candidate, steps=0)
         assert not decided
+
+
+def test_one_row_beside_boxes_needs_no_steps() -> None:
+    """Its deepest point and the bounds of the slack there decide, as those of a ball do."""
+    normals, offsets = torch.randn(500, 1, 3), 1.5 * torch.rand(500, 1) - 0.5
+    normals[:50, :, 1] = 0
+    for side in (1.0, 0.7):
+        bounds = Box(-torch.ones(500, 3), torch.tensor([1.0, side, 1.0]).expand(500, 3))
+        sets = [bounds, HalfSpaces(normals, offsets * normals.norm(dim=-1))]
+        anchor, decided = attempt_anchor(sets, steps=0)
+        least = torch.stack([s.slack(anchor) for s in sets]).amin(0)
+        best = chebyshev_center([s.to(torch.float64) for s in sets], share=0.99)
+        assert torch.equal(decided, best.slack > 1e-3)
+        assert (least >= 0.3 * best.upper_bound)[decided].all()
 
 
 def test_only_states_left_undecided_are_searched() -> None:

@@ -43,8 +43,11 @@ FRACTION = 0.95
 ENOUGH = 0.5
 """The share of the best slack from which on a point stays, where the number of steps is fixed."""
 
-_SMALL = 10
-"""The largest number of unknowns for which elimination side by side is the fastest."""
+_SMALL, _FEW = 10, 256
+"""Up to this many unknowns, and from this many states on, elimination side by side is faster."""
+
+_MANY = 128
+"""The number of states from which on it is faster to leave out half of them."""
 
 
 class Ascent:
@@ -109,7 +112,7 @@ class Ascent:
             deep = slacks.least >= torch.maximum(least, share * self.upper)
             done = deep | (self.upper < -least)
             count = len(done) - int(done.sum()) if check <= steps else 0
-            if 2 * count <= len(done):
+            if not count or (2 * count <= len(done) and len(done) >= _MANY):
                 here = self.of.action(self.x).mT
                 if left is None:
                     anchor, upper, decided = here, self.upper, deep
@@ -178,8 +181,8 @@ class Ascent:
             diagonal = torch.addcmul(diagonal, weights[row], curvature)
         corner = near.sum((0, 1)).unsqueeze(0)
         hessian = torch.diag_embed(torch.cat([diagonal, corner]).mT, dim1=0, dim2=1)
-        hessian[:-1, -1] -= cross
-        hessian[-1, :-1] -= cross
+        hessian[:-1, -1].sub_(cross)
+        hessian[-1, :-1].sub_(cross)
         right = [(of.slopes * wanted_near).sum(0), 1 - wanted_near.sum((0, 1)).unsqueeze(0)]
         pull = torch.cat(right)
         if len(rest):
@@ -189,7 +192,7 @@ class Ascent:
                 left.append(root * (weights[row] / height))
                 factors.append(root)
             scaled, other = (torch.cat(v) if at.roots else v[0] for v in (left, factors))
-            hessian = hessian + (scaled.unsqueeze(1) * other.unsqueeze(2)).sum(0)
+            hessian += (scaled.unsqueeze(1) * other.unsqueeze(2)).sum(0)
             pull = pull + (wanted_rest.unsqueeze(1) * at.gradient).sum(0)
         # Where rounding error is all that is left, there may be infinities.
         move = _solve(hessian, pull).nan_to_num(posinf=0.0, neginf=0.0)
@@ -228,7 +231,9 @@ def _steepness(root: Tensor, height: Tensor, move: Tensor) -> Tensor:
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve with positive definite matrices ``(n, n, B)``, by elimination where they are small."""
-    if len(right) > _SMALL and not torch.compiler.is_exporting():
+    compiles = torch.compiler.is_compiling()
+    side_by_side = len(right) <= _SMALL and (compiles or right.shape[-1] >= _FEW)
+    if not (side_by_side or torch.compiler.is_exporting()):
         solution = torch.linalg.solve_ex(matrix.permute(2, 0, 1), right.mT.unsqueeze(-1))[0]
         return solution.squeeze(-1).mT
     rest = torch.cat([matrix, right.unsqueeze(1)], 1)

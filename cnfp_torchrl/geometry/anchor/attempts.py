@@ -81,9 +81,10 @@ class Attempt(NamedTuple):
 def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Attempt:
     r"""Try the middle of all bounding boxes, a point that sets of closed form agree on, and others.
 
-    Where a ball is all there is beside boxes, the points find the best slack t up to a share of
-    :math:`1 / (1 + \sqrt d)`: no point of the boxes has more slack in the ball than the one next to
-    its center, which loses :math:`\sqrt d\, s` at most by moving inwards by s in each component.
+    Where one set of closed form, such as a ball or a half-space, is all there is beside boxes, the
+    points find the best slack t up to a share of :math:`1 / (1 + \sqrt d)`: no point of the boxes
+    has more slack in that set than its deepest one, which loses :math:`\sqrt d\, s` at most by
+    moving inwards by s in each component.
 
     Args:
         sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.
@@ -115,9 +116,12 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
 
 def _is_described(constraint_set: ConstraintSet) -> bool:
     """Tell whether steps inwards see all of a set, so that they make up for a first attempt."""
-    kind = type(constraint_set)
-    described = kind.superlevel is not ConstraintSet.superlevel
-    return described and kind.part_near is ConstraintSet.part_near
+    described = type(constraint_set).superlevel is not ConstraintSet.superlevel
+    return described and _is_convex(constraint_set)
+
+
+def _is_convex(constraint_set: ConstraintSet) -> bool:
+    return type(constraint_set).part_near is ConstraintSet.part_near
 
 
 def _bounding_box(bounds: Box, sets: Sequence[ConstraintSet]) -> Bounds:
@@ -147,10 +151,12 @@ def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
     Returns:
         The attempts in all states, side by side.
     """
+    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
+    if all(map(_is_convex, sets)) and bool((before.upper < -largest).all()):
+        return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
         return further_attempt(sets, before, STEPS).select()
-    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
     return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
 
 

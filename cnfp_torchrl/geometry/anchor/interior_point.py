@@ -13,12 +13,21 @@ bounded over the action bounds: no bound rests on convergence.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 
-from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index, Program, length, times
+from cnfp_torchrl.geometry.anchor.program import (
+    START,
+    Array,
+    Flags,
+    Index,
+    Program,
+    length,
+    times,
+)
 
 MAX_ITERATIONS = 60
 """The number of steps after which the best point so far is taken; 6 are usual, 20 rare."""
@@ -29,8 +38,11 @@ _LARGEST = 3.0
 _FRACTION = 0.995
 """The share of the way to the boundary that a step may go."""
 
-_SMALL = 8
-"""The largest number of unknowns for which elimination side by side is the fastest."""
+_SMALL, _MANY = 8, 64
+"""Up to this many unknowns, and from this many problems on, elimination side by side is faster."""
+
+_FEW = 8
+"""The number of problems up to which it takes no longer to go on with all than with some."""
 
 
 class Best(NamedTuple):
@@ -73,14 +85,23 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
         found, largest, bound = x.copy(), np.empty(len(start)), np.empty(len(start))
         left = np.arange(len(start))
         path = _Path.begin(problem, x)
-        lower, upper, best = x[problem.dim] + 1, problem.bound(), x
+        lower, upper, best = x[problem.dim] + START, problem.bound(), x.copy()
         proof = np.zeros_like(path.rates)
         weights = np.empty_like(proof)
+        undecided = np.ones(len(start), dtype=bool)
         for iteration in range(MAX_ITERATIONS + 1):
+            least, above = path.bounds()
+            better, nearer = undecided & (least > lower), undecided & (above < upper)
+            np.copyto(best, path.x, where=better)
+            np.copyto(lower, least, where=better)
+            np.copyto(upper, above, where=nearer)
+            np.copyto(proof, path.proof(), where=nearer)
             scale = problem.unit[left]
             undecided = ~settled(lower * scale, upper * scale, left)
+            # Beyond rounding error a path may end in NaN, from where no step leads on.
+            undecided &= np.isfinite(path.x[problem.dim])
             count = int(undecided.sum()) if iteration < MAX_ITERATIONS else 0
-            if count <= len(left) // 2:
+            if not count or 2 * count <= len(left) > _FEW:
                 # Until then those that are settled go on with the others, but count no more.
                 found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
                 weights[:, left] = proof / (proof * path.rates).sum(0)
@@ -89,16 +110,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
                 path, left, best = path.select(undecided), left[undecided], best[:, undecided]
                 lower, upper, proof = lower[undecided], upper[undecided], proof[:, undecided]
                 undecided = undecided[undecided]
-            slack, height = path.slacks()
-            rooms, above, product = path.bounds(slack, height)
-            least = (rooms + path.spare).min(0)
-            better = undecided & (least > lower)
-            best = np.where(better, path.x, best)
-            lower = np.where(better, least, lower)
-            nearer = undecided & (above < upper)
-            upper = np.where(nearer, above, upper)
-            proof = np.where(nearer, path.proof(), proof)
-            path.advance(slack, height, product)
+            path.advance()
         return Best(problem.action(found), largest, bound, weights[2 * len(problem.reach) :])
 
 
@@ -119,6 +131,9 @@ class _Path:
         weights: Weights of the rows, ``(M, B)``.
         duals: Weights of the cones, ``(J, 1 + k, B)``.
         dim: The number d of components of an action, after which t stands in x.
+        slack: Slacks of the rows at x, ``(M, B)``.
+        height: Slacks of the cones at x, ``(J, 1 + k, B)``.
+        product: The weighted sums of all slacks, once bounds are known, ``(B,)``.
     """
 
     rows: Array
@@ -133,6 +148,9 @@ class _Path:
     weights: Array
     duals: Array
     dim: int
+    slack: Array
+    height: Array
+    product: Array
 
     @classmethod
     def begin(cls, problem: Program, x: Array) -> Self:
@@ -154,9 +172,12 @@ class _Path:
             weights=problem.offsets,
             duals=problem.tips,
             dim=dim,
+            slack=problem.offsets,
+            height=problem.tips,
+            product=problem.unit,
         )
-        slack, height = path.slacks()
-        weights, duals = 1 / slack, _flipped(height) / _det(height)[:, None]
+        path.move(x)
+        weights, duals = 1 / path.slack, _flipped(path.height) / _det(path.height)[:, None]
         pull = (np.concatenate([weights, duals[:, 0]]) * rates).sum(0)
         # What is not maximized may be nearly touched, yet matter little in the end.
         most = np.where(rates > 0, np.inf, _LARGEST)
@@ -171,47 +192,44 @@ class _Path:
         values = vars(self).items()
         return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values})
 
-    def slacks(self) -> tuple[Array, Array]:
-        """Return the slacks of rows ``(M, B)`` and of cones ``(J, 1 + k, B)``."""
-        slack = self.offsets - times(self.rows, self.x)
-        return slack, self.tips - times(self.cones, self.x) if len(self.cones) else self.tips
-
-    def bounds(self, slack: Array, height: Array) -> tuple[Array, Array, Array]:
-        """Bound the best t.
-
-        Returns:
-            By how much rows and cones hold without t, ``(M + J, B)``, upper bounds of the best t,
-            and the weighted sums of all slacks, ``(B,)`` each.
-        """
-        rooms, pull = slack, _pulled(self.rows, self.weights)
-        product = (slack * self.weights).sum(0)
+    def move(self, x: Array) -> None:
+        """Go to points."""
+        self.x, self.slack = x, self.offsets - times(self.rows, x)
         if len(self.cones):
-            rooms = np.concatenate([slack, height[:, 0] - length(height[:, 1:])])
-            product = product + (height * self.duals).sum((0, 1))
-            pull = pull + _pulled(_side_by_side(self.cones), _side_by_side(self.duals))
+            self.height = self.tips - times(self.cones, x)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the largest t at the points, and upper bounds of the best one, ``(B,)`` each."""
+        rooms, pull = self.slack, _pulled(self.rows, self.weights)
+        self.product = (self.slack * self.weights).sum(0)
+        if len(self.cones):
+            size = length(self.height[:, 1:])
+            rooms = np.concatenate([rooms, self.height[:, 0] - size])
+            self.product += (self.height * self.duals).sum((0, 1))
+            pull += _pulled(_side_by_side(self.cones), _side_by_side(self.duals))
         # What the weighted mean of all slacks may become within the bounds.
         rest = np.maximum((self.x - self.low) * pull, (self.x - self.high) * pull)
-        rest[self.dim] = product
+        rest[self.dim] = self.product
         t = self.x[self.dim]
-        return rooms + self.rates * t, t + rest.sum(0) / pull[self.dim], product
+        return t + (rooms + self.spare).min(0), t + rest.sum(0) / pull[self.dim]
 
     def proof(self) -> Array:
         """Return the weights of rows and cones in the upper bounds, ``(M + J, B)``."""
         return np.concatenate([self.weights, self.duals[:, 0]])
 
-    def advance(self, slack: Array, height: Array, product: Array) -> None:
-        """Take a step, from slacks and their weighted sums.
+    def advance(self) -> None:
+        """Take a step.
 
         For rows all is relative to their slacks and weights, for cones in a scaling in which the
         two are the same vector.
         """
-        count, cones = len(slack), len(self.cones)
-        measure = self.weights / slack
-        left, right = self.rows * measure[:, None], self.rows
+        slack, count, cones = self.slack, len(self.slack), len(self.cones)
+        left, right = self.rows * (self.weights / slack)[:, None], self.rows
         if cones:
-            scaling = ConeScaling.between(height, self.duals)
+            scaling = ConeScaling.between(self.height, self.duals)
             scaled = _side_by_side(scaling.unscaled(self.cones))
             point = scaling.scaled(self.duals)
+            mirror = _flipped(point)
             left, right = np.concatenate([left, scaled]), np.concatenate([right, scaled])
         inverse = _inverted(left, right)
         # First a step without centering: the less it would gain, the more centering there is.
@@ -220,15 +238,18 @@ class _Path:
         limit = np.maximum(fall.max(0), 1 - fall.min(0))
         if cones:
             falls = times(scaled, move).reshape(point.shape)
-            limit = np.maximum(limit, _limits(point, np.stack([falls, point - falls])).max(0))
+            along, root = _crossing(mirror, scaling.det, falls)
+            # Weights fall by what is left of the slacks: they cross at the other root.
+            steepest = (np.maximum(along, scaling.det - along) + root) / scaling.det
+            limit = np.maximum(limit, steepest.max(0))
         far = 1 - 1 / np.maximum(limit, 1)
-        center = far * far * far * product / (count + cones)
+        center = far * far * far * self.product / (count + cones)
         aim = center / (slack * self.weights) + fall * (fall - 1)
         pull = -_pulled(self.rows, self.weights * aim)
         if cones:
             wanted = _product(falls, falls - point)
             wanted[:, 0] += center
-            aims = _quotient(wanted, point)
+            aims = _quotient(wanted, point, mirror, scaling.det)
             pull -= _pulled(scaled, _side_by_side(aims))
         pull[self.dim] += 1
         move = times(inverse, pull)
@@ -238,27 +259,28 @@ class _Path:
         if cones:
             falls = times(scaled, move).reshape(point.shape)
             losses = point - aims - falls
-            limits = _limits(point, np.stack([falls, losses]))
-            ahead = along = np.maximum(limits.max(0), np.maximum(ahead, along))
+            crossing = _crossing(mirror, scaling.det, np.stack([falls, losses]))
+            limits = (sum(crossing) / scaling.det).max((0, 1))
+            ahead = along = np.maximum(limits, np.maximum(ahead, along))
         ahead, along = (_FRACTION / np.maximum(limit, _FRACTION) for limit in (ahead, along))
-        self.x = self.x + ahead * move
         self.weights = self.weights * (1 - along * loss)
         if cones:
             self.duals = self.duals - along * scaling.unscaled(losses)
+        self.move(self.x + ahead * move)
 
 
-def _limits(point: Array, changes: Array) -> Array:
-    """Return the inverse of the largest steps of slacks and weights of cones, ``(2, B)``.
+def _crossing(mirror: Array, det: Array, change: Array) -> tuple[Array, Array]:
+    """Return two terms whose sum, divided by det, is the inverse of the largest step in cones.
 
     Args:
-        point: Slacks, which are as large as the weights, in the scaling of the step.
-        changes: What a step takes off the slacks and off the weights, ``(2, J, 1 + k, B)``.
+        mirror: Points in the cones, flipped, ``(J, 1 + k, B)``.
+        det: Their determinants, ``(J, B)``.
+        change: What a step takes off the points, ``(..., J, 1 + k, B)``.
     """
-    # A cone is left where point - step * changes has a determinant of 0, a quadratic.
-    det, along = _det(point), (_flipped(point) * changes).sum(2)
-    squared = np.square(changes[:, :, 0]) - np.square(changes[:, :, 1:]).sum(2)
-    steepest = (along + np.sqrt(np.maximum(along * along - squared * det, 0))) / det
-    return np.asarray(steepest.max(1), dtype=np.float64)
+    # A cone is left where point - step * change has a determinant of 0, a quadratic.
+    along = (mirror * change).sum(-2)
+    squared = 2 * np.square(change[..., 0, :]) - np.square(change).sum(-2)
+    return along, np.sqrt(np.maximum(along * along - squared * det, 0))
 
 
 class ConeScaling(NamedTuple):
@@ -268,19 +290,21 @@ class ConeScaling(NamedTuple):
         head: The first components of the axes, which are of determinant 1, ``(J, B)``.
         tail: Other components of the axes, ``(J, k, B)``.
         size: Sizes ``(J, B)``.
+        det: Determinants of the vectors that slacks and weights become, ``(J, B)``.
     """
 
     head: Array
     tail: Array
     size: Array
+    det: Array
 
     @classmethod
     def between(cls, slack: Array, weight: Array) -> Self:
         """Return the scaling for slacks and weights ``(J, 1 + k, B)`` inside of the cones."""
-        of_slack, of_weight = _det(slack), _det(weight)
-        s, z = slack / np.sqrt(of_slack)[:, None], weight / np.sqrt(of_weight)[:, None]
+        of_slack, of_weight = (np.sqrt(_det(v)) for v in (slack, weight))
+        s, z = slack / of_slack[:, None], weight / of_weight[:, None]
         axis = (s + _flipped(z)) / np.sqrt(2 + 2 * (s * z).sum(1))[:, None]
-        return cls(axis[:, 0], axis[:, 1:], np.sqrt(np.sqrt(of_slack / of_weight)))
+        return cls(axis[:, 0], axis[:, 1:], np.sqrt(of_slack / of_weight), of_slack * of_weight)
 
     def scaled(self, v: Array) -> Array:
         """Return W v, of vectors ``(J, 1 + k, B)``."""
@@ -292,7 +316,7 @@ class ConeScaling(NamedTuple):
 
     def unscaled(self, v: Array) -> Array:
         """Return the inverse of W times v, of vectors ``(J, 1 + k, B)`` or ``(J, 1 + k, n, B)``."""
-        head, tail, size = self
+        head, tail, size, _ = self
         if v.ndim == 4:
             head, tail, size = head[:, None], tail[:, :, None], size[:, None]
         dot = (tail * v[:, 1:]).sum(1)
@@ -310,12 +334,13 @@ def _inverted(left: Array, right: Array) -> Array:
     """
     matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
     axes = np.arange(matrix.shape[-1])
-    if len(axes) > _SMALL:
+    if len(axes) > _SMALL or len(matrix) < _MANY:
         # Rounding may have made a matrix singular.
         matrix[:, axes, axes] *= 1 + 1e-14
         # Of problems that went on after they were settled, which no longer count.
         matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(axes))
-        return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
+        with suppress(np.linalg.LinAlgError):
+            return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
     inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
     least = 1e-15 * inverse[axes, axes]
     # The sweep operator (Goodnight 1979), which leaves the negative inverse.
@@ -361,9 +386,9 @@ def _product(u: Array, v: Array) -> Array:
     return result
 
 
-def _quotient(u: Array, v: Array) -> Array:
-    """Return what gives u when multiplied by v, by the Jordan product."""
-    first = ((_flipped(v) * u).sum(1) / _det(v))[:, None]
+def _quotient(u: Array, v: Array, mirror: Array, det: Array) -> Array:
+    """Return what gives u when multiplied by v, of which more is known, by the Jordan product."""
+    first = ((mirror * u).sum(1) / det)[:, None]
     result = (u - first * v) / v[:, :1]
     result[:, :1] = first
     return result

@@ -103,6 +103,19 @@ class Intersection:
         middle, half = self.program.middle.T, self.program.half.T
         return middle - half, middle + half
 
+    def middle_of_boxes(self, least: Array) -> Array:
+        """Return the middles of the boxes around the sets, ``(B, d)``.
+
+        From the highest priority down those boxes count that leave half widths of ``(B,)``.
+        """
+        low, high = self.bounds
+        for constraint_set in reversed(self.sets[1:]):
+            lower, upper = (bound.numpy() for bound in constraint_set.bounding_box())
+            lower, upper = np.maximum(low, lower), np.minimum(high, upper)
+            wide = ((upper - lower).min(-1) > 2 * least)[:, None]
+            low, high = np.where(wide, lower, low), np.where(wide, upper, high)
+        return (low + high) / 2
+
     def rows_of(self, index: int) -> slice:
         """Return where the rows of a set stand."""
         first = sum(self.widths[:index])

@@ -25,6 +25,9 @@ Array: TypeAlias = NDArray[np.float64]
 Flags: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.int64]
 
+START = 0.3
+"""The distance of a first slack below the largest one at an action, in mean half widths."""
+
 
 @dataclass(frozen=True, eq=False)
 class Program:
@@ -62,15 +65,15 @@ class Program:
         """Stack descriptions, each with batch shape ``(B,)``: kinked sums, rows and cones.
 
         Args:
-            parts: Descriptions in float64, one for each set.
+            parts: Descriptions in float64 on the CPU, one for each set.
             bounds: Finite bounds of the actions, ``(B, d)``.
         """
         rows = [part for part in parts if isinstance(part, Rows)]
         cones = [part for part in parts if isinstance(part, Cone)]
         sums = [part for part in parts if isinstance(part, KinkedSum)]
         batch, dim = bounds.low.shape
-        low, high = batch_last(bounds.low, batch, 1), batch_last(bounds.high, batch, 1)
-        middle, half = (low + high) / 2, (high - low) / 2
+        low, high = batch_last(bounds.low, 1), batch_last(bounds.high, 1)
+        middle, half = map(np.ascontiguousarray, ((low + high) / 2, (high - low) / 2))
         unit = half.sum(0) / dim
         terms = len(sums) * dim
         width = dim + 1 + terms
@@ -82,26 +85,26 @@ class Program:
         each = np.arange(dim)
         for i, total in enumerate(sums):
             own = i * dim + each
-            rate = batch_last(total.rate, batch, 0) * unit
+            rate = batch_last(total.rate, 0) * unit
             counts = rate > 0
             rate = np.where(counts, rate, 1.0)
             steepest = np.zeros((dim, batch))
             for j, slope in enumerate((total.upper, total.lower)):
-                relative = batch_last(slope, batch, 1) / rate
+                relative = batch_last(slope, 1) / rate
                 stacked[j * terms + own, each] = relative * half
                 stacked[j * terms + own, dim + 1 + own] = -1
                 offsets[j * terms + own] = -relative * middle
                 steepest = np.maximum(steepest, np.abs(relative))
             reach[own] = steepest * np.maximum(np.abs(low), np.abs(high))
             stacked[2 * terms + i, dim + 1 + own] = 1
-            size = batch_last(total.size, batch, 0) / rate
+            size = batch_last(total.size, 0) / rate
             offsets[2 * terms + i] = np.where(counts, size, np.inf)
             loose[2 * terms + i] = 3 + 2 * reach[own].sum(0)
         for part in rows:
             last = first + part.offsets.shape[-1]
-            rates = batch_last(part.rates, batch, 1)
-            normals = batch_last(part.normals, batch, 2) / rates[:, None]
-            places = batch_last(part.offsets, batch, 1) / rates
+            rates = batch_last(part.rates, 1)
+            normals = batch_last(part.normals, 2) / rates[:, None]
+            places = batch_last(part.offsets, 1) / rates
             offsets[first:last] = (places - times(normals, middle)) / unit
             stacked[first:last, :dim] = normals * (half / unit)
             first = last
@@ -109,12 +112,12 @@ class Program:
         stacked_cones = np.zeros((len(cones), height, width, batch))
         tips = np.zeros((len(cones), height, batch))
         for i, cone in enumerate(cones):
-            rate = batch_last(cone.rate, batch, 0) * unit
-            matrix = batch_last(cone.matrix, batch, 2) / rate
+            rate = batch_last(cone.rate, 0) * unit
+            matrix = batch_last(cone.matrix, 2) / rate
             last = 1 + len(matrix)
             stacked_cones[i, 1:last, :dim] = -matrix * half
-            tips[i, 1:last] = batch_last(cone.vector, batch, 1) / rate + times(matrix, middle)
-            tips[i, 0] = batch_last(cone.size, batch, 0) / rate
+            tips[i, 1:last] = batch_last(cone.vector, 1) / rate + times(matrix, middle)
+            tips[i, 0] = batch_last(cone.size, 0) / rate
         return cls(stacked, offsets, loose, stacked_cones, tips, middle, half, unit, reach)
 
     def requiring(self, required: Array, maximized: Flags, counts: Flags) -> Self:
@@ -182,9 +185,9 @@ class Program:
         return np.ascontiguousarray((self.middle + self.half * x[: self.dim]).T)
 
     def start(self, action: Array) -> Array:
-        """Return x strictly inside at an action, its slack a mean half width below the possible."""
+        """Return x strictly inside at an action, its slack below the largest there."""
         x = self.at(action)
-        x[self.dim] = self.slack_of(x) - 1
+        x[self.dim] = self.slack_of(x) - START
         if terms := len(self.reach):
             sums = slice(2 * terms, 2 * terms + terms // self.dim)
             room = self.offsets[sums] - times(self.rows[sums], x)
@@ -223,11 +226,10 @@ class Program:
         return np.where(self.rates() > 0, most, np.inf).min(0)
 
 
-def batch_last(value: Tensor, batch: int, events: int) -> Array:
-    """Return values ``(*B, *event)`` as ``(*event, B)``."""
-    array = value.detach().cpu().numpy()
-    event = array.shape[array.ndim - events :]
-    return np.ascontiguousarray(np.moveaxis(np.broadcast_to(array, (batch, *event)), 0, -1))
+def batch_last(value: Tensor, events: int) -> Array:
+    """Return values ``(B, *event)`` or, the same for all, ``(*event,)`` as ``(*event, B or 1)``."""
+    array: Array = value.detach().numpy()
+    return array[..., None] if array.ndim == events else array.transpose(*range(1, events + 1), 0)
 
 
 def times(matrix: Array, x: Array) -> Array:

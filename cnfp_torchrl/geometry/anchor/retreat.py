@@ -15,8 +15,8 @@ SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 def retreat(
     some: Intersection,
     best: Best,
+    rooms: Array,
     before: Array,
-    required: Array,
     gain: Array,
     counts: Flags,
     sure: Flags,
@@ -31,28 +31,27 @@ def retreat(
     Args:
         some: B intersections.
         best: Points of the least relaxation.
-        before: Points strictly inside of the rows that were not maximized, ``(B, d)``.
-        required: Slacks that were required of the rows, ``(B, R)``.
+        rooms: Rooms there in the rows, as they have given way, ``(B, R)``.
+        before: Rooms at points strictly inside of the rows that were not maximized, ``(B, R)``.
         gain: Amounts by which the rows gave way, ``(B, R)``.
         counts: Flags of the rows that counted, ``(B, R)``.
         sure: Flags of those of them that hold or have given way, ``(B, R)``; the others may.
 
     Returns:
-        Points ``(B, d)``, and upper bounds of the smallest room in the rows that counted, ``(B,)``.
+        Shares of the way back to these points, ``(B, 1)``, and upper bounds of the smallest room in
+        the rows that counted, ``(B,)``.
     """
     # Of rows that may give way later those go on that need not at the best point.
-    rooms, there = (some.row_slacks(point) - required + gain for point in (best.action, before))
     kept = counts & (sure | (rooms > 0)) & np.isfinite(rooms)
-    rooms, change = np.where(kept, rooms, np.inf), np.where(kept, there - rooms, 0.0)
+    rooms, change = np.where(kept, rooms, np.inf), np.where(kept, before - rooms, 0.0)
     end = np.clip(np.where(change < 0, rooms / -change, np.inf).min(-1), 0, 1)
     part = np.concatenate([np.zeros((1, len(end))), SHARES[:, None] * end])
     least = (rooms + part[..., None] * change).min(-1)
     chosen = part[least.argmax(0), np.arange(len(end))]
-    action = best.action + chosen[:, None] * (before - best.action)
-    upper = np.full(len(action), np.inf)
+    upper = np.full(len(chosen), np.inf)
     if best.weights is not None:
         at = some.described
         weights = np.where(counts[:, at].T, best.weights, 0.0)
         bound = (best.upper_bound + (weights * gain[:, at].T).sum(0)) / weights.sum(0)
         upper = np.fmin(upper, bound)
-    return action, upper
+    return chosen[:, None], upper

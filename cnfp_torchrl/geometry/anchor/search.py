@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from itertools import chain
 from typing import NamedTuple, Self
 
@@ -16,8 +17,8 @@ from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.retreat import retreat
 from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
-SHARE = 0.45
-"""The share of the best slack that a searched anchor has."""
+SHARE = 0.35
+"""The share of the best slack that a searched anchor has, no less than attempts have."""
 
 PRECISION = 0.02
 """The largest distance of an amount from the least one, as a share of the depth."""
@@ -51,7 +52,7 @@ class Search:
     """The lexicographic rule for B states, by the certified method.
 
     It keeps for each of the R rows of all sets its depth, its relaxation so far, and whether it
-    counts yet, and for each state a point strictly inside of the rows that count.
+    counts yet, and for each state a point strictly inside of the rows that count, with its slacks.
 
     Args:
         everything: Sets of the states.
@@ -62,7 +63,8 @@ class Search:
     def __init__(self, everything: Intersection, depth: Array, leeway: Array) -> None:
         low, high = everything.bounds
         self.everything, self.depth, self.leeway = everything, depth, leeway
-        self.kept = (low + high) / 2
+        self.kept = everything.middle_of_boxes(2 * depth[:, everything.rows_of(0)].max(-1))
+        self.slacks = everything.row_slacks(self.kept)
         self.upper = np.full(len(depth), np.inf)
         self.relaxation = np.zeros_like(depth)
         self.far = depth >= _FAR * np.sqrt(np.square(high - low).sum(-1, keepdims=True))
@@ -107,27 +109,33 @@ class Search:
         if len(left):
             some = self._select(left)
             # From afar, as float64 sees it, nothing can be told of what is near.
-            near = np.abs(start[left] - some.kept) <= some.everything.program.half.T
-            some.kept = np.where(near.all(-1, keepdims=True), start[left], some.kept)
+            low, high = some.everything.bounds
+            near = ((low <= start[left]) & (start[left] <= high)).all(-1, keepdims=True)
+            some.kept = np.where(near, start[left], some.kept)
             fits[left] = some._fit(~some.far)
-            self.kept[left] = np.where(fits[left][:, None], some.kept, self.kept[left])
+            self._take(some, left, fits[left])
         # Far rows hold or give way wherever the anchor is.
         if self.far.any():
-            rooms = self.everything.row_slacks(self.kept) - self.depth
-            fits = fits & ((rooms >= 0) | ~self.far).all(-1)
+            fits = fits & ((self.slacks >= self.depth) | ~self.far).all(-1)
         left = (~fits).nonzero()[0]
         if len(left):
             rest = self._select(left)
             rest._relax()
-            self.kept[left], self.relaxation[left] = rest.kept, rest.relaxation
-            self.dropped[left] = rest.dropped
+            self._take(rest, left)
+            self.relaxation[left], self.dropped[left] = rest.relaxation, rest.dropped
 
     def _select(self, index: Index) -> Search:
         """Return the search for some states, from where it is now."""
-        some = Search(self.everything.select(index), self.depth[index], self.leeway[index])
-        some.kept, some.relaxation = self.kept[index], self.relaxation[index]
-        some.counts, some.dropped = self.counts[index], self.dropped[index]
+        some = copy(self)
+        for name, value in vars(self).items():
+            if name != "everything":
+                setattr(some, name, value[index])
+        some.everything = self.everything.select(index)
         return some
+
+    def _take(self, some: Search, index: Index, mask: Flags | slice = slice(None)) -> None:
+        """Take over the points of some states, or of those in a mask."""
+        self.kept[index[mask]], self.slacks[index[mask]] = some.kept[mask], some.slacks[mask]
 
     def _relax(self) -> None:
         """Decide one set after the other, and then the anchor."""
@@ -137,7 +145,7 @@ class Search:
             rows[:, self.everything.rows_of(k)] = True
             far = rows & self.far
             if far.any():
-                short = self.depth - self.everything.row_slacks(self.kept) + self.leeway[:, None]
+                short = self.depth - self.slacks + self.leeway[:, None]
                 self.relaxation = np.where(far & (short > 0), short, self.relaxation)
             rows = rows & ~far
             left = rows.any(-1)
@@ -151,13 +159,13 @@ class Search:
                 self.dropped[:, k] = left
                 rows = rows & ~left[:, None]
             self.counts = self.counts | rows
-        rooms = self.everything.row_slacks(self.kept) - (self.depth - self.relaxation)
+        rooms = self.slacks - (self.depth - self.relaxation)
         least, depth = (np.where(self.counts, v, np.inf).min(-1) for v in (rooms, self.depth))
         left = (~_is_deep(least, self.upper, depth)).nonzero()[0]
         if len(left):
             some = self._select(left)
             some._fit(some.counts)
-            self.kept[left] = some.kept
+            self._take(some, left)
 
     def _give_way(self, k: int, maximized: Flags) -> None:
         """Relax the maximized rows by lexicographic minimax."""
@@ -165,7 +173,7 @@ class Search:
         counts, maximized = self.counts.copy(), maximized.copy()
         while True:
             required = self.depth - self.relaxation
-            rooms = self.everything.row_slacks(self.kept) - required
+            rooms = self.slacks - required
             left = (np.where(maximized, rooms, np.inf).min(-1) < precision).nonzero()[0]
             if not len(left):
                 return
@@ -178,7 +186,8 @@ class Search:
 
             on = counts[left] | rising
             best = some.maximize(needs, rising, on, self.kept[left], settled)
-            rooms = some.row_slacks(best.action) - needs
+            there = some.row_slacks(best.action)
+            rooms = there - needs
             least = np.where(rising, rooms, np.inf).min(-1)
             gives = least <= wanted / 4
             binding = rising & (rooms <= (least + 5 * wanted)[:, None]) & gives[:, None]
@@ -189,7 +198,10 @@ class Search:
             gain = given - self.relaxation[left]
             self.relaxation[left] = given
             sure = on & ~maximized[left]
-            self.kept[left], upper = retreat(some, best, self.kept[left], needs, gain, on, sure)
+            rooms, before = (slacks - needs + gain for slacks in (there, self.slacks[left]))
+            share, upper = retreat(some, best, rooms, before, gain, on, sure)
+            self.kept[left] = best.action + share * (self.kept[left] - best.action)
+            self.slacks[left] = some.row_slacks(self.kept[left])
             self.upper[left] = np.where(gives, upper, self.upper[left])
 
     def _fit(self, rows: Flags) -> Flags:
@@ -202,8 +214,19 @@ class Search:
         fits = found.slack >= 0
         kept = self.kept
         self.kept = np.where(fits[:, None], found.action, kept)
-        if all(self.everything.convex) or fits.all():
-            return np.asarray(fits)
+        if not (all(self.everything.convex) or fits.all()):
+            self._fit_parts(rows, fits, kept)
+        self.slacks = self.everything.row_slacks(self.kept)
+        return np.asarray(fits)
+
+    def _fit_parts(self, rows: Flags, fits: Flags, kept: Array) -> None:
+        """Try other convex parts of non-convex sets, from points of the best so far and around.
+
+        Args:
+            rows: Flags of the rows, ``(B, R)``.
+            fits: Flags of the states in which there is a point, which change, ``(B,)``.
+            kept: Points strictly inside of the rows that count, ``(B, d)``.
+        """
         of_convex = rows.copy()
         for k, convex in enumerate(self.everything.convex):
             of_convex[:, self.everything.rows_of(k)] &= convex
@@ -218,7 +241,6 @@ class Search:
             found = self._roomiest(part, rows, left)
             fits[left] = found.slack >= 0
             self.kept[left] = np.where(fits[left][:, None], found.action, self.kept[left])
-        return np.asarray(fits)
 
     def _roomiest(self, part: Intersection, rows: Flags, index: Index | None = None) -> Best:
         """Find points with most slack beyond what rows require, or that there are none.
