@@ -131,10 +131,13 @@ class HalfSpaces(ConstraintSet):
             validate_args=False,
         )
 
+    def select(self, batch_shape: torch.Size, index: Tensor) -> Self:
+        if self._kept is None:
+            return super().select(batch_shape, index)
+        return self._of(self._kept.select(batch_shape, index))
+
     def superlevel(self) -> Rows:
-        normals, offsets, rates = self._rows_last()
-        normals = normals.movedim((0, 1), (-2, -1))
-        return Rows(normals, offsets.movedim(0, -1), rates.movedim(0, -1))
+        return self._rows_last().batch_first()
 
     def _rows_last(self, batch_dims: int = 0) -> _Rows:
         """Return the rows in about unit length, with at least so many batch dimensions."""
@@ -161,11 +164,14 @@ class HalfSpaces(ConstraintSet):
     def _with(self, rows: _Rows, offsets: Tensor) -> Self:
         """Return the set with the normals of some rows and other offsets."""
         passed = (rows.normals == 0).all(1) & (offsets >= 0)
-        rows = rows._replace(offsets=torch.where(passed, torch.inf, offsets))
-        normals = rows.normals.movedim((0, 1), (-2, -1))
-        moved = type(self)(normals, rows.offsets.movedim(0, -1), validate_args=False)
-        moved._keep(rows)
-        return moved
+        return self._of(rows._replace(offsets=torch.where(passed, torch.inf, offsets)))
+
+    def _of(self, rows: _Rows) -> Self:
+        """Return the set of some rows."""
+        known = rows.batch_first()
+        half_spaces = type(self)(known.normals, known.offsets, validate_args=False)
+        half_spaces._keep(rows)
+        return half_spaces
 
     def _keep(self, rows: _Rows) -> None:
         # A compiler sees by itself what is computed twice.
@@ -192,6 +198,19 @@ class _Rows(NamedTuple):
             return self
         events = (2, 1, 1)
         return _Rows(*(_spread(v, n, batch_dims) for v, n in zip(self, events, strict=True)))
+
+    def select(self, batch_shape: torch.Size, index: Tensor) -> _Rows:
+        """Return the rows of some batch elements, given by their flat indices in a batch shape."""
+        rows = self.spread(len(batch_shape))
+        events = [value.shape[: value.ndim - len(batch_shape)] for value in rows]
+        all_rows = (v.expand(*event, *batch_shape) for v, event in zip(rows, events, strict=True))
+        flat = (v.reshape(*event, -1) for v, event in zip(all_rows, events, strict=True))
+        return _Rows(*(value.index_select(-1, index) for value in flat))
+
+    def batch_first(self) -> Rows:
+        """Return the description of the rows."""
+        normals = self.normals.movedim((0, 1), (-2, -1))
+        return Rows(normals, self.offsets.movedim(0, -1), self.rates.movedim(0, -1))
 
     def along(self, vector: Tensor) -> Tensor:
         """Return the products with vectors ``(*batch, d)``, of no more dimensions than here."""

@@ -124,7 +124,8 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
         # Steps inwards for the states that need them, and the search for those that need more.
         some = shape
         if len(left) < len(anchor):
-            sets = [s.select(shape, left) for s in sets]
+            # Not action bounds that are the same for all, of which more is known.
+            sets = [s.select(shape, left) if s.batch_shape else s for s in sets]
             some, found = left.shape, found.select(left)
         refined = refined_attempt(sets, found.view(some))
         anchor = anchor.index_copy(0, left, refined.anchor)
