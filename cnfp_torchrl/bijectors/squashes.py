@@ -73,8 +73,7 @@ class BoxSquash(Bijector):
 
     def _set_image(self, image: Box) -> None:
         super().__init__()
-        self._middle = (image.low + image.high) / 2
-        self._half = (image.high - image.low) / 2
+        self._middle, self._half = image.middle_and_half()
         self._log_slope_scale = (4 * self._half).log()
 
     def about(self, anchor: Tensor) -> Self:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from math import prod
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
@@ -27,12 +27,13 @@ _RARE_KEY = (STATE_KEY, "rare")
 """The key of that pointer among a state's entries."""
 
 
-class _Field(NamedTuple):
-    """The position of an entry in the bytes of a state."""
+class _Block(NamedTuple):
+    """The entries of one dtype, which lie side by side in the bytes of a state."""
 
-    key: NestedKey
     dtype: torch.dtype
-    shape: torch.Size
+    shapes: dict[NestedKey, torch.Size]
+    widths: list[int]
+    """The numbers that each entry has."""
     start: int
     stop: int
 
@@ -65,7 +66,9 @@ class _Ring:
     def take(self, numbers: Tensor) -> Tensor:
         """Return the rows of some numbers."""
         assert self.rows is not None
-        return self.rows[numbers % len(self.rows)]
+        # Whole rows, not element by element as indexing with several dimensions copies bytes.
+        rows = self.rows.index_select(0, (numbers % len(self.rows)).flatten())
+        return rows.unflatten(0, numbers.shape)
 
     def nbytes(self, oldest: int) -> int:
         """Return the bytes of the rows from the oldest on."""
@@ -101,8 +104,8 @@ class PackedStates(Transform):
         self._rare_keys = [key for key in keys if key in rare]
         self._keys = [key for key in keys if key not in rare]
         self._max_size = max_size
-        self._fields: list[_Field] = []
-        self._rare_fields: list[_Field] = []
+        self._blocks: list[_Block] = []
+        self._rare_blocks: list[_Block] = []
         # Enough for episodes of 8 steps and longer; memory that is not written takes no room.
         self._states, self._rare = _Ring(max_size + max_size // 8), _Ring(16)
         self._before: Tensor | None = None
@@ -141,7 +144,7 @@ class PackedStates(Transform):
         start = self._append(torch.cat([after, root[new]]), count)
         self._before = after
         keys = [*self._keys, *self._rare_keys]
-        packed = tensordict.exclude(*keys, *(_under_next(key) for key in keys))
+        packed = tensordict.exclude(*keys, *(_under_next(key) for key in keys)).filter_empty_()
         packed[STATE_KEY, "root"] = start + position
         packed[STATE_KEY, "step"] = (number - position).to(torch.int32)
         return packed
@@ -149,24 +152,21 @@ class PackedStates(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the entries of the states into sampled transitions."""
         pointers = tensordict.pop(STATE_KEY)
-        root = pointers["root"]
-        rows = self._states.take(torch.stack([root, root + pointers["step"]]))
-        parts = tensordict, tensordict.get("next")
-        for field in self._fields:
-            if field.key != _RARE_KEY:
-                _write(parts, field, rows)
-        if self._rare_fields:
-            at = next(field for field in self._fields if field.key == _RARE_KEY)
-            numbers = rows[..., at.start : at.stop].view(torch.int32).squeeze(-1)
+        root = pointers.get("root")
+        rows = self._states.take(torch.stack([root, root + pointers.get("step")]))
+        at_root: dict[str, Any] = {}
+        after: dict[str, Any] = {}
+        pointer = _write((at_root, after), self._blocks, rows)
+        if pointer is not None:
             if self._rare.end == 0:
-                rare = rows.new_zeros(*numbers.shape, _width(self._rare_fields))
+                rare = rows.new_zeros(*rows.shape[:-1], _width(self._rare_blocks))
             else:
                 # Their numbers begin with 1; 0 stands for zeros.
-                rare = self._rare.take((numbers - 1).clamp(min=0))
-                rare = rare * (numbers > 0).unsqueeze(-1)
-            for field in self._rare_fields:
-                _write(parts, field, rare)
-        return tensordict
+                rare = self._rare.take((pointer - 1).clamp(min=0)) * (pointer > 0).unsqueeze(-1)
+            _write((at_root, after), self._rare_blocks, rare)
+        # Unchecked, because to set entry by entry takes ten times as long.
+        entries = _merged(tensordict, {**at_root, "next": after})
+        return TensorDict._new_unsafe(entries, tensordict.batch_size, tensordict.device)
 
     def get_extra_state(self) -> dict[str, Any]:
         return {key: self.__dict__[key] for key in _STATE}
@@ -177,42 +177,42 @@ class PackedStates(Transform):
 
     def _packed(self, state: TensorDictBase) -> Tensor:
         """Return the entries of states as rows of bytes, those of the rare entries last."""
-        if not self._fields:
+        if not self._blocks:
             entries = {key: state.get(key) for key in self._keys}
             if self._rare_keys:
                 entries[_RARE_KEY] = torch.empty(1, dtype=torch.int32)
-            self._fields = _layout(entries)
-            self._rare_fields = _layout({key: state.get(key) for key in self._rare_keys})
+            self._blocks = _layout(entries)
+            self._rare_blocks = _layout({key: state.get(key) for key in self._rare_keys})
         like = state.get(self._keys[0])
         zero = torch.zeros(len(like), 1, dtype=torch.uint8, device=like.device)
         parts = []
-        for fields in (self._fields, self._rare_fields):
-            for key, dtype, *_ in fields:
-                if key == _RARE_KEY:
-                    parts.append(zero.expand(-1, RARE_BYTES))
-                    continue
-                value = state.get(key)
-                if value.dtype != dtype:
-                    raise ValueError(
-                        f"key {key!r}: expected {dtype}, as in the transitions before, given "
-                        f"{value.dtype}"
-                    )
-                flat = value.reshape(len(value), -1).contiguous()
-                parts.append(flat.view(torch.uint8))
-            parts.append(zero.expand(-1, _width(fields) - (fields[-1].stop if fields else 0)))
+        for blocks in (self._blocks, self._rare_blocks):
+            for block in blocks:
+                for key in block.shapes:
+                    if key == _RARE_KEY:
+                        parts.append(zero.expand(-1, RARE_BYTES))
+                        continue
+                    value = state.get(key)
+                    if value.dtype != block.dtype:
+                        raise ValueError(
+                            f"key {key!r}: expected {block.dtype}, as in the transitions before, "
+                            f"given {value.dtype}"
+                        )
+                    flat = value.reshape(len(value), -1).contiguous()
+                    parts.append(flat.view(torch.uint8))
+            parts.append(zero.expand(-1, _width(blocks) - (blocks[-1].stop if blocks else 0)))
         return torch.cat(parts, -1)
 
     def _append(self, packed: Tensor, count: int) -> int:
         """Write the new states of a batch of transitions and return the first one's number."""
-        rows, rare = packed.tensor_split([_width(self._fields)], -1)
+        rows, rare = packed.tensor_split([_width(self._blocks)], -1)
         self._batches.append((count, self._batch_start, self._batch_rare_start))
         self._stored += count
         while self._stored - self._batches[0][0] >= self._max_size:
             self._stored -= self._batches.popleft()[0]
         _, oldest, oldest_rare = self._batches[0]
         self._batch_rare_start = self._rare.end
-        if self._rare_fields:
-            at = next(field for field in self._fields if field.key == _RARE_KEY)
+        if self._rare_blocks:
             index = (rare != 0).any(-1).nonzero().squeeze(-1)
             if len(index):
                 first = self._rare.append(rare[index], oldest_rare)
@@ -220,14 +220,14 @@ class PackedStates(Transform):
                 numbers[index, 0] = (
                     1 + first + torch.arange(len(index), dtype=torch.int32, device=rows.device)
                 )
-                rows[:, at.start : at.stop] = numbers.view(torch.uint8)
+                rows[:, _bytes_of(_RARE_KEY, self._blocks)] = numbers.view(torch.uint8)
         self._batch_start = self._states.append(rows, oldest)
         return self._batch_start
 
 
 _STATE = (
-    "_fields",
-    "_rare_fields",
+    "_blocks",
+    "_rare_blocks",
     "_states",
     "_rare",
     "_before",
@@ -238,29 +238,70 @@ _STATE = (
 )
 
 
-def _write(parts: tuple[TensorDictBase, TensorDictBase], field: _Field, rows: Tensor) -> None:
-    """Write an entry of states and next states from their rows of bytes, ``(2, batch, bytes)``."""
-    values = rows[..., field.start : field.stop].view(field.dtype)
-    for part, value in zip(parts, values.unflatten(-1, field.shape or (1,)), strict=True):
-        part.set(field.key, value if field.shape else value.squeeze(-1))
+def _write(
+    trees: Iterable[dict[str, Any]], blocks: Iterable[_Block], rows: Tensor
+) -> Tensor | None:
+    """Write the entries of states from their rows of bytes, a batch of rows for each nested dict.
+
+    Returns the pointers to rows of rare entries instead of writing them.
+    """
+    pointers = []
+    for tree, row in zip(trees, rows, strict=True):
+        for dtype, shapes, widths, start, stop in blocks:
+            values = row[:, start:stop].view(dtype).split_with_sizes(widths, -1)
+            for (key, shape), value in zip(shapes.items(), values, strict=True):
+                if len(shape) != 1:
+                    value = value.unflatten(-1, shape) if shape else value.squeeze(-1)
+                if key == _RARE_KEY:
+                    pointers.append(value)
+                    continue
+                *path, name = (key,) if isinstance(key, str) else key
+                branch = tree
+                for step in path:
+                    branch = branch.setdefault(step, {})
+                branch[name] = value
+    return torch.stack(pointers) if pointers else None
 
 
-def _layout(entries: dict[NestedKey, Tensor]) -> list[_Field]:
+def _merged(known: TensorDictBase, tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of a tensordict and of a nested dict, which wins, as a nested dict."""
+    entries = dict(known.items())
+    for name, branch in tree.items():
+        inner = entries.get(name)
+        is_inner = isinstance(branch, dict) and inner is not None
+        entries[name] = _merged(inner, branch) if is_inner else branch
+    return entries
+
+
+def _layout(entries: Mapping[NestedKey, Tensor]) -> list[_Block]:
     """Return where entries stand, those of the widest dtype first, so that all are aligned."""
-    fields, stop = [], 0
-    for key in sorted(entries, key=lambda key: -entries[key].dtype.itemsize):
-        value = entries[key]
-        start, shape = stop, value.shape[1:]
-        stop += prod(shape) * value.dtype.itemsize
-        fields.append(_Field(key, value.dtype, shape, start, stop))
-    return fields
+    by_dtype: dict[torch.dtype, dict[NestedKey, torch.Size]] = {}
+    for key, value in entries.items():
+        by_dtype.setdefault(value.dtype, {})[key] = value.shape[1:]
+    blocks, stop = [], 0
+    for dtype in sorted(by_dtype, key=lambda dtype: -dtype.itemsize):
+        shapes = by_dtype[dtype]
+        widths = [prod(shape) for shape in shapes.values()]
+        start, stop = stop, stop + sum(widths) * dtype.itemsize
+        blocks.append(_Block(dtype, shapes, widths, start, stop))
+    return blocks
 
 
-def _width(fields: Sequence[_Field]) -> int:
+def _bytes_of(wanted: NestedKey, blocks: Iterable[_Block]) -> slice:
+    """Return where an entry stands in the rows."""
+    for dtype, shapes, widths, start, _ in blocks:
+        if wanted in shapes:
+            at = list(shapes).index(wanted)
+            first = start + sum(widths[:at]) * dtype.itemsize
+            return slice(first, first + widths[at] * dtype.itemsize)
+    raise KeyError(wanted)
+
+
+def _width(blocks: Sequence[_Block]) -> int:
     """Return the bytes of a row, aligned to its widest dtype, which comes first."""
-    if not fields:
+    if not blocks:
         return 0
-    stop, widest = fields[-1].stop, fields[0].dtype.itemsize
+    stop, widest = blocks[-1].stop, blocks[0].dtype.itemsize
     return stop + -stop % widest
 
 

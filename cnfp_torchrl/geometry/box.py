@@ -46,7 +46,9 @@ class Box(ConstraintSet):
     high: Tensor
 
     event_dims: ClassVar[Mapping[str, int]] = {"low": 1, "high": 1}
-    _kept: ClassVar[_Kept | None] = None  # an instance's own where it is prepared
+    # An instance's own where it is prepared.
+    _kept: ClassVar[_Kept | None] = None
+    _halves: ClassVar[tuple[Tensor, Tensor] | None] = None
 
     def invalid_fields(self) -> Iterator[tuple[str, Tensor, str]]:
         # NaN where both are the same infinity.
@@ -88,6 +90,12 @@ class Box(ConstraintSet):
             return self._kept.width
         return (self.high - self.low).amin(-1)
 
+    def middle_and_half(self) -> tuple[Tensor, Tensor]:
+        """Return the middles of all sides and half of their lengths, both ``(*batch, d)``."""
+        if self._halves is not None:
+            return self._halves
+        return (self.low + self.high) / 2, (self.high - self.low) / 2
+
     def prepared(self) -> Self:
         """Return the box with what flows and anchors ask of action bounds computed once.
 
@@ -95,8 +103,9 @@ class Box(ConstraintSet):
         """
         box = type(self)(self.low.detach(), self.high.detach(), validate_args=False)
         magnitude = box.magnitude()
-        about = box.eroded(magnitude), box.rounding(magnitude)
-        kept = _Kept(magnitude, box.smallest_width(), *about)
+        eroded = box.eroded(magnitude)
+        object.__setattr__(eroded, "_halves", eroded.middle_and_half())
+        kept = _Kept(magnitude, box.smallest_width(), eroded, box.rounding(magnitude))
         object.__setattr__(box, "_kept", kept)
         return box
 

@@ -48,6 +48,7 @@ class Region:
         self.active = active
         self.relaxation = relaxation
         self._anchor = anchor
+        self._shape: torch.Size | None = None
         if validate_args:
             self._validate()
 
@@ -96,9 +97,11 @@ class Region:
     @property
     def shape(self) -> torch.Size:
         """The shape ``(*batch, d)`` of the actions."""
-        others = [value.shape[:-1] for value in (self._anchor, self.active) if value is not None]
-        sets = (constraint_set.batch_shape for constraint_set in self.sets)
-        return torch.Size((*broadcast_shape(*others, *sets), self.bounds.dim))
+        if self._shape is None:
+            given = [value.shape[:-1] for value in (self._anchor, self.active) if value is not None]
+            sets = (constraint_set.batch_shape for constraint_set in self.sets)
+            self._shape = torch.Size((*broadcast_shape(*given, *sets), self.bounds.dim))
+        return self._shape
 
     @property
     def is_active(self) -> Tensor:

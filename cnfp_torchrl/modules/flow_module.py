@@ -253,16 +253,14 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         return self._bounds.on(device)
 
     def _region(self, tensordict: TensorDictBase, *, validate_args: bool = False) -> Region:
+        anchor = require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
         return Region(
             [self._bounds_beside(tensordict), *(b.get_set(tensordict) for b in self.bijectors)],
-            self._anchor(tensordict),
+            anchor,
             self._active(tensordict),
-            self._relaxation(tensordict),
+            self._relaxation(tensordict, anchor.new_zeros(())),
             validate_args=validate_args,
         )
-
-    def _anchor(self, tensordict: TensorDictBase) -> Tensor:
-        return require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
 
     def _active(self, tensordict: TensorDictBase) -> Tensor | None:
         if not self.bijectors:
@@ -272,9 +270,9 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         ]
         return torch.stack([torch.ones_like(flags[0]), *flags], dim=-1)
 
-    def _relaxation(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """Return the amounts by which the rows of each set are widened, 0 for the bounds."""
-        amounts = [self._anchor(tensordict).new_zeros(())]
+    def _relaxation(self, tensordict: TensorDictBase, of_bounds: Tensor) -> tuple[Tensor, ...]:
+        """Return the amounts by which the rows of each set are widened, the bounds' first."""
+        amounts = [of_bounds]
         for bijector in self.bijectors:
             amount = require(tensordict, bijector.amounts_key, _ANCHOR_REMEDY)
             amounts.append(amount if bijector.row_relaxation_key else amount.unsqueeze(-1))

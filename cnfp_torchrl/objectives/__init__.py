@@ -1,6 +1,7 @@
 """Losses that TorchRL lacks."""
 
 from cnfp_torchrl.objectives.batched_sac import BatchedSACLoss
+from cnfp_torchrl.objectives.fused_adam import FusedAdam
 from cnfp_torchrl.objectives.ppo import ConstrainedPPOLoss
 from cnfp_torchrl.objectives.sac import ConstrainedSACLoss, usual_target_entropy
 from cnfp_torchrl.objectives.sac_lagrangian import SACLagrangianLoss
@@ -12,6 +13,7 @@ __all__ = [
     "ConstrainedPPOLoss",
     "ConstrainedSACLoss",
     "ConstrainedTD3Loss",
+    "FusedAdam",
     "FusedSoftUpdate",
     "SACLagrangianLoss",
     "usual_target_entropy",

@@ -94,18 +94,32 @@ class _Both:
         self, parts: Sequence[TensorDictBase], written: Sequence[dict[NestedKey, Tensor]]
     ) -> None:
         self._parts, self._written = parts, written
+        # The nested tensordicts of both, by their paths: to look up each entry by its whole path
+        # takes as long as to stack it.
+        self._nested: dict[tuple[str, ...], list[TensorDictBase | None]] = {(): [*parts]}
         self.shape = self.batch_size = torch.Size((2, *parts[0].batch_size))
         self.device = parts[0].device
 
     def get(self, key: NestedKey, default: Tensor | None = None) -> Tensor | None:
-        values = [
-            known[key] if key in known else part.get(key, None)
-            for part, known in zip(self._parts, self._written, strict=True)
-        ]
-        return default if any(value is None for value in values) else torch.stack(values)
+        if key in self._written[0]:
+            return torch.stack([known[key] for known in self._written])
+        *path, name = (key,) if isinstance(key, str) else key
+        first, second = (_entry(part, name) for part in self._at(tuple(path)))
+        return default if first is None or second is None else torch.stack((first, second))
+
+    def _at(self, path: tuple[str, ...]) -> list[TensorDictBase | None]:
+        """Return the tensordicts of both at a path, None where there is none."""
+        if path not in self._nested:
+            outer = self._at(path[:-1])
+            self._nested[path] = [_entry(part, path[-1]) for part in outer]
+        return self._nested[path]
 
     def keys(self, *args: Any, **kwargs: Any) -> Iterable[NestedKey]:
         return self._parts[1].keys(*args, **kwargs)
+
+
+def _entry(tensordict: TensorDictBase | None, name: str) -> Any:
+    return None if tensordict is None else tensordict.get(name, None)
 
 
 def _written(body: list[TensorDictModule], tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:

@@ -56,15 +56,16 @@ class BatchedSACLoss(SACLoss):
         if self._version == 1 or self.skip_done_states:
             return super().forward(tensordict)
         next_drawn, drawn = self._draw_both(tensordict)
-        loss_qvalue, metadata = self._critics_loss(tensordict, next_drawn)
+        alpha = self._alpha
+        loss_qvalue, metadata = self._critics_loss(tensordict, next_drawn, alpha)
         tensordict.set(self.tensor_keys.priority, metadata["td_error"])
         log_prob = drawn[1].detach()
         losses = {
-            "loss_actor": self._actor_loss(tensordict, drawn),
+            "loss_actor": self._actor_loss(tensordict, drawn, alpha),
             "loss_qvalue": loss_qvalue,
             "loss_alpha": self._reduced(self._alpha_loss(log_prob), tensordict),
         }
-        scalars = {"alpha": self._alpha, "entropy": -log_prob.mean()}
+        scalars = {"alpha": alpha, "entropy": -log_prob.mean()}
         if self.reduction != "none":
             return TensorDict({**losses, **scalars}, [])
         returned = TensorDict(losses, tensordict.batch_size)
@@ -76,7 +77,7 @@ class BatchedSACLoss(SACLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the actor's loss, and the ``log_prob`` of the actions that it drew."""
         drawn = self._draw(tensordict)
-        return self._actor_loss(tensordict, drawn), {"log_prob": drawn[1].detach()}
+        return self._actor_loss(tensordict, drawn, self._alpha), {"log_prob": drawn[1].detach()}
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the critics' loss, summed over them, and their largest ``td_error``."""
@@ -84,21 +85,21 @@ class BatchedSACLoss(SACLoss):
         if not self.skip_done_states:
             with torch.no_grad():
                 drawn = self._draw(tensordict.get("next"))
-        return self._critics_loss(tensordict, drawn)
+        return self._critics_loss(tensordict, drawn, self._alpha)
 
-    def _actor_loss(self, tensordict: TensorDictBase, drawn: Drawn) -> Tensor:
+    def _actor_loss(self, tensordict: TensorDictBase, drawn: Drawn, alpha: Tensor) -> Tensor:
         action, log_prob = drawn
         value = self._values("qvalue_network", tensordict, action, detached=True)
-        return self._reduced(self._alpha * log_prob - value.amin(0).squeeze(-1), tensordict)
+        return self._reduced(alpha * log_prob - value.amin(0).squeeze(-1), tensordict)
 
     def _critics_loss(
-        self, tensordict: TensorDictBase, drawn: Drawn | None
+        self, tensordict: TensorDictBase, drawn: Drawn | None, alpha: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the critics' loss, for next actions given as drawn or left for TorchRL to draw."""
         if drawn is None:
             target = self._compute_target_v2(tensordict)
         else:
-            target = self._target(tensordict, *drawn)
+            target = self._target(tensordict, *drawn, alpha)
         action = tensordict.get(self.tensor_keys.action)
         predicted = self._values("qvalue_network", tensordict, action).squeeze(-1)
         target = target.expand_as(predicted)
@@ -107,11 +108,13 @@ class BatchedSACLoss(SACLoss):
         return self._reduced(loss, tensordict), {"td_error": td_error}
 
     @torch.no_grad()
-    def _target(self, tensordict: TensorDictBase, action: Tensor, log_prob: Tensor) -> Tensor:
+    def _target(
+        self, tensordict: TensorDictBase, action: Tensor, log_prob: Tensor, alpha: Tensor
+    ) -> Tensor:
         value = self._values("target_qvalue_network", tensordict.get("next"), action)
         if value.shape[1:] != log_prob.shape:
             log_prob = log_prob.unsqueeze(-1)
-        soft = (value - self._alpha * log_prob).amin(0)
+        soft = (value - alpha * log_prob).amin(0)
         estimator = self.value_estimator
         if getattr(estimator, "average_rewards", False):
             tensordict = tensordict.clone(False)  # whose rewards it replaces

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -44,8 +46,8 @@ class Update:
         actor_every: The number of steps of the critics for one of actor and targets; more than 1
             needs a loss with a ``critic_loss`` of its own, such as `ConstrainedTD3Loss`.
         max_grad_norm: The largest norm of the gradient, which is shortened to it; None leaves it.
-        compiled: Whether to compile the loss and its backward pass, which takes a minute or more,
-            once.
+        compiled: Whether to compile the loss and its backward pass, which takes up to a minute,
+            once, at the second step.
     """
 
     def __init__(
@@ -64,16 +66,21 @@ class Update:
         self.count = 0
         """The number of steps so far."""
         self._actor_every, self._max_grad_norm = actor_every, max_grad_norm
-        self._losses = torch.compile(loss) if compiled else loss
+        self._losses, self._to_compile = loss, compiled
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Make one step and return what the loss returned."""
         self.count += 1
         is_whole = self.count % self._actor_every == 0
         losses = self._losses(batch) if is_whole else self.loss.critic_loss(batch)
+        if is_whole and self._to_compile:
+            # Not before the first step, at which losses make what they keep: it would be compiled
+            # a second time.
+            self._losses, self._to_compile = torch.compile(self.loss), False
         # Parameters without a gradient, such as the actor's in between, stay as they are.
         self.optimizer.zero_grad(set_to_none=True)
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        parts = [value for name, value in losses.items() if name.startswith("loss_")]
+        reduce(torch.add, parts).backward()
         if self._max_grad_norm is not None:
             nn.utils.clip_grad_norm_(self.loss.parameters(), self._max_grad_norm)
         self.optimizer.step()

@@ -388,6 +388,20 @@ def test_stacked_networks_are_the_networks(
     torch.testing.assert_close(torch.autograd.grad((mine * direction).sum(), given), theirs)
 
 
+def test_compiled_rectifiers_are_relu_s(fresh_compiler: None) -> None:
+    stacked = StackedPerceptron([nn.ReLU()])
+    given = torch.tensor([[0.0, -0.0, 2.0, -3.0, 1e-40, 1e30, torch.inf]], requires_grad=True)
+
+    @torch.compile(backend="eager")
+    def compiled(values: Tensor) -> Tensor:
+        return stacked(values, {})
+
+    for values in (compiled(given), stacked(given, {})):
+        (gradient,) = torch.autograd.grad(values.sum(), given)
+        assert values.tolist() == [[0, 0, 2, 0, given[0, 4].item(), given[0, 5].item(), torch.inf]]
+        assert gradient.tolist() == [[0, 0, 1, 0, 1, 1, 1]]
+
+
 def hooked() -> nn.Module:
     network = nn.Sequential(nn.Linear(3, 2))
     network[0].register_forward_hook(lambda module, given, result: 2 * result)

@@ -154,7 +154,10 @@ def stepped_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None, ste
     found = first_attempt(sets, candidate)
     if not all(map(_is_described, sets)) or _is_settled_at_first(sets):
         return found
-    refined = refined_attempt(sets, found, steps, reads=False).view(found.decided.shape)
+    depth = functools.reduce(torch.maximum, (depths.amax(-1) for depths in row_depths(sets)))
+    ascent = Ascent(sets, found.anchor, found.upper)
+    refined = Attempt(*ascent.run_until(steps, SHARE, depth, reads=False))
+    refined = refined.view(found.decided.shape)
     is_new = (refined.decided & ~found.decided).unsqueeze(-1)
     anchor = torch.where(is_new, refined.anchor, found.anchor)
     return Attempt(anchor, found.upper, found.decided | refined.decided)
@@ -168,27 +171,23 @@ def _is_settled_at_first(sets: Sequence[ConstraintSet]) -> bool:
     return all(s.deepest_within(bounds.bounding_box()) is not None for s in others)
 
 
-def refined_attempt(
-    sets: Sequence[ConstraintSet], before: Attempt, steps: int = REFINEMENT, *, reads: bool = True
-) -> Attempt:
+def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt, depth: Tensor) -> Attempt:
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
         sets: Sets of batch shapes that broadcast.
         before: The attempt to start from, ``(*batch,)``.
-        steps: The largest number of steps.
-        reads: Whether it is read on the host which states need steps.
+        depth: The largest depth of an anchor in any row, ``(*batch,)``.
 
     Returns:
         The attempts in all states, side by side.
     """
-    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
-    if reads and all(map(_is_convex, sets)) and bool((before.upper < -largest).all()):
+    if all(map(_is_convex, sets)) and bool((before.upper < -depth).all()):
         return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
         return further_attempt(sets, before, STEPS).select()
-    return Attempt(*ascent.run_until(steps, SHARE, largest, reads=reads))
+    return Attempt(*ascent.run_until(REFINEMENT, SHARE, depth))
 
 
 def _roomiest(

@@ -136,19 +136,25 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
     left = (~found.decided).nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
-        some = shape
-        if len(left) < len(anchor):
+        # Where these are most states, choosing them takes longer than steps in the others.
+        some, part = sets, shape
+        if 2 * len(left) < len(anchor):
             # Not action bounds that are the same for all, of which more is known.
-            sets = [s.select(shape, left) if s.batch_shape else s for s in sets]
-            some, found = left.shape, found.select(left)
-        refined = refined_attempt(sets, found.view(some))
+            some = [s.select(shape, left) if s.batch_shape else s for s in sets]
+            part, found = left.shape, found.select(left)
+        depths = [depth.expand(*part, depth.shape[-1]) for depth in row_depths(some)]
+        depth = torch.cat(depths, -1)
+        refined = refined_attempt(some, found.view(part), depth.amax(-1))
+        depth = depth.reshape(-1, depth.shape[-1])
+        if part is shape:
+            refined, depth = refined.select(left), depth[left]
         anchor = anchor.index_copy(0, left, refined.anchor)
         hard = (~refined.decided).nonzero().squeeze(-1)
-        sets = [s.select(some, hard) for s in sets] if len(hard) else sets
         found, left = refined.select(hard), left[hard]
     if len(left):
+        sets, depth = [s.select(shape, left) for s in sets], depth[hard]
         margin = leeway * bounds_of(sets).smallest_width()
-        searched = Search.of(sets, row_depths(sets), margin).run(found.anchor, found.upper)
+        searched = Search.of(sets, depth, margin).run(found.anchor, found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active.to(active.device))
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.
