@@ -1,6 +1,6 @@
 """Audit the geometry of an environment: `python experiments/audit.py key=value ...`."""
 
-from cnfp_torchrl.commands.audit import main
+from cnfp_torchrl.commands.console import audit
 
 if __name__ == "__main__":
-    main()
+    audit()

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from cnfp_torchrl.audit.states import bare, difference
+from cnfp_torchrl.audit.states import bare, before_concatenation, difference
 from cnfp_torchrl.envs import Indicator, StateSetter, constraint_names
 from cnfp_torchrl.keys import COST_KEY
 from cnfp_torchrl.modules import ConstrainedFlowModule
@@ -112,6 +112,7 @@ class StateSetterLookahead(Lookahead):
     ) -> None:
         self.env, self.state_setter = env, state_setter
         self.states, self.reader = states, reader
+        self._shown = before_concatenation(env, states)
 
     def outcome(self, actions: Tensor) -> Outcome:
         flat = actions.flatten(0, 1)
@@ -120,9 +121,10 @@ class StateSetterLookahead(Lookahead):
         for first in range(0, len(flat), size):
             # The last batch is filled up with a pair of state and action that is repeated.
             pair = torch.arange(first, first + size).clamp(max=len(flat) - 1)
-            states = self.states[pair % len(self.states)].reshape(shape)
-            shown = self.state_setter(bare(self.env), states)
-            if (key := difference(self.env, states, shown)) is not None:
+            index = pair % len(self.states)
+            states, expected = (x[index].reshape(shape) for x in (self.states, self._shown))
+            shown = self.state_setter(bare(self.env), expected)
+            if (key := difference(bare(self.env), expected, shown)) is not None:
                 name = type(bare(self.env)).__name__
                 raise ValueError(
                     f"state_setter: expected a function that puts {name} into given states, but "

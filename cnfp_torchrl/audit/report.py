@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from textwrap import fill
 from typing import Any
 
 from torch import Tensor
@@ -302,11 +303,25 @@ def _paragraphs(report: AuditReport) -> Iterator[str]:
         rows.append([name, *map(str, counts)])
     yield f"{text_table(rows)}\nin {executed.steps} steps of the policy"
     if report.notes:
-        yield "\n".join(f"note: {note}" for note in report.notes)
+        yield _wrapped("note: ", report.notes)
     yield from _examples(report)
     flaws = report.flaws
     not_judged = f"; {', '.join(unjudged)}: not judged" if unjudged else ""
-    yield "\n".join(f"FLAW: {flaw}" for flaw in flaws) if flaws else f"no flaw found{not_judged}"
+    yield _wrapped("FLAW: ", flaws) if flaws else f"no flaw found{not_judged}"
+
+
+def _wrapped(prefix: str, sentences: Iterable[str]) -> str:
+    """Return sentences below each other, of lines as wide as the tables may be."""
+    return "\n".join(
+        fill(
+            f"{prefix}{sentence}",
+            100,
+            subsequent_indent="  ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for sentence in sentences
+    )
 
 
 def _examples(report: AuditReport) -> Iterator[str]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cnfp_torchrl.envs import StateSetter
+from cnfp_torchrl.envs import StateSetter, observed_entries
 from cnfp_torchrl.keys import COST_KEY
 
 _NO_END = 1e30
@@ -24,12 +24,13 @@ def bare(env: EnvBase) -> EnvBase:
 
 
 def state_keys(env: EnvBase) -> list[NestedKey]:
-    """Return what the environment itself, without transforms, shows of a state."""
+    """Return what an environment shows of a state itself, and its transforms do not remove."""
     spec, batch = bare(env).observation_spec, env.batch_size.numel()
+    shown = env.observation_spec.keys(include_nested=True, leaves_only=True)
     return [
         key
         for key in spec.keys(include_nested=True, leaves_only=True)
-        if key != COST_KEY and spec[key].shape.numel() <= LARGEST_ENTRY * batch
+        if key != COST_KEY and spec[key].shape.numel() <= LARGEST_ENTRY * batch and key in shown
     ]
 
 
@@ -64,8 +65,21 @@ def _between(low: Tensor, high: Tensor) -> Tensor:
     return torch.where(has_low & has_high, inner, torch.where(has_low | has_high, one_end, noise))
 
 
+def before_concatenation(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+    """Return states with the parts of vectors that TorchRL's `CatTensors` has made of them.
+
+    Those that it removes, too, and those that it has written the vector over.
+    """
+    keys = env.observation_spec.keys(include_nested=True, leaves_only=True)
+    parts = states.copy()
+    for entry in observed_entries(env, keys):
+        for key, value in entry.split(states.get(entry.key)).items():
+            parts.set(key, value)
+    return parts
+
+
 def difference(env: EnvBase, expected: TensorDictBase, given: TensorDictBase) -> NestedKey | None:
-    """Return a key of the state that differs, or None."""
+    """Return a key of the state that differs, of those of `state_keys`, or None."""
     for key in state_keys(env):
         a, b = expected.get(key).double(), given.get(key).double()
         if not torch.allclose(a, b, rtol=1e-5, atol=1e-6, equal_nan=True):

@@ -30,7 +30,7 @@ def audit_configured(config: DictConfig) -> AuditReport:
     settings: AuditSettings = instantiate(config.audit)
     audited, folder = config, None
     if config.run is not None:
-        folder = RunFolder.open(config.run)
+        folder = RunFolder.open(config.run, config.checkpoint)
         audited = folder.load_config(config.trusted)
     env = build_environment(audited, batch_size=[config.batch], with_anchor=True)
     return audit(

@@ -9,7 +9,7 @@ from dataclasses import replace
 from textwrap import fill
 
 from cnfp_torchrl.commands.extras import needs_extra
-from cnfp_torchrl.commands.trusted import TRUSTED
+from cnfp_torchrl.commands.run_options import FINISHED_RUN
 
 with needs_extra("train"):
     import torch
@@ -21,7 +21,7 @@ with needs_extra("train"):
     from cnfp_torchrl.modules import flow_head
     from cnfp_torchrl.training.agent import build_environment, load_actor
     from cnfp_torchrl.training.episodes import record_episode
-    from cnfp_torchrl.training.run_folder import RunFolder
+    from cnfp_torchrl.training.run_folder import CHECKPOINT, RunFolder
     from cnfp_torchrl.training.settings import EvaluationSettings
     from cnfp_torchrl.visual.explanation import explain
     from cnfp_torchrl.visual.replay import replay_step
@@ -75,7 +75,8 @@ def explain_run(
     steps = record_episode(env, actor, settings, episode, deterministic=deterministic)
     setting = Setting.of(head, env)
     policy = "deterministic" if deterministic else "stochastic"
-    title = f"episode {episode}, seed {settings.seed + episode}, {policy} policy"
+    of = "" if folder.checkpoint == CHECKPOINT else f" of {folder.checkpoint}"
+    title = f"episode {episode}, seed {settings.seed + episode}, {policy} policy{of}"
     if step is None:
         records = step_records(actor, steps, setting.costs)
         if every_step:
@@ -105,9 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="cnfp-explain",
         description="Explain what a trained policy did in an episode: the steps worth a look, or "
         "one step, the action before and after each constraint, and why.",
-        parents=[TRUSTED],
+        parents=[FINISHED_RUN],
     )
-    parser.add_argument("run", help="folder of a finished run")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--step", type=int, help="of the episode, from 0 (those worth a look)")
     which.add_argument(
@@ -121,7 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     options = vars(given)
     with errors_in_a_sentence(parser.prog, status=2):
-        explanation = explain_run(RunFolder.open(options.pop("run")), **options)
+        folder = RunFolder.open(options.pop("run"), options.pop("checkpoint"))
+        explanation = explain_run(folder, **options)
     sys.stdout.write(explanation)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnfp_torchrl.commands.extras import needs_extra
-from cnfp_torchrl.commands.trusted import TRUSTED
+from cnfp_torchrl.commands.run_options import FINISHED_RUN
 
 with needs_extra("train"):
     import torch
@@ -62,6 +62,7 @@ def export_run(
     state = with_noise(policy, [value[:1] for value in visited])
     manifest = {
         **read_manifest(output),
+        "checkpoint": folder.checkpoint,
         "self_test": self_test(policy, run, visited),
         "milliseconds_for_one_state": latencies({"eager": policy, to: run}, state),
     }
@@ -89,9 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="cnfp-export",
         description="Export a trained policy as one graph, from the observation to the allowed "
         "action, with a manifest and a self-test.",
-        parents=[TRUSTED],
+        parents=[FINISHED_RUN],
     )
-    parser.add_argument("run", help="folder of a finished run")
     parser.add_argument("--to", choices=FORMATS, default="onnx", help="format (onnx)")
     parser.add_argument("--output", help="folder to write into (RUN/export)")
     parser.add_argument(
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "install 'cnfp_torchrl[export]'\n",
         )
     with errors_in_a_sentence(parser.prog, status=2):
-        folder = RunFolder.open(options.pop("run"))
+        folder = RunFolder.open(options.pop("run"), options.pop("checkpoint"))
         output = Path(options.pop("output") or folder.path / "export")
         options["fallback"] = _numbers(options["fallback"])
         manifest = export_run(folder, output, **options)

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from cnfp_torchrl.commands.extras import needs_extra
-from cnfp_torchrl.commands.trusted import TRUSTED
+from cnfp_torchrl.commands.run_options import TRUSTED
 
 with needs_extra("train"):
     from cnfp_torchrl.commands.paths import quoted

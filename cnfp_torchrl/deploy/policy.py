@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import SafeProbabilisticTensorDictSequential
 
-from cnfp_torchrl.envs import GeometryTransform, observed_entries, refuse_changed_inputs
+from cnfp_torchrl.envs import GeometryTransform, leaf_specs, observed_entries, refuse_changed_inputs
 from cnfp_torchrl.geometry import Box, ConstraintSet, Region, attempt_anchor, row_depths
-from cnfp_torchrl.keys import ANCHOR_KEY, CONSTRAINTS_KEY, SAFE_ACTION_KEY
+from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import (
     ActionBounds,
     action_bounds,
@@ -92,7 +92,7 @@ class DeployedPolicy(nn.Module):
         self.parameter_keys, self.action_dtype = head.parameter_keys, head.action_dtype
         self.bounds = ActionBounds(head.bounds)
         self.entries = observed_entries(env, self._read_keys())
-        self.inputs = {leaf.key: leaf.spec for entry in self.entries for leaf in entry.leaves()}
+        self.inputs = leaf_specs(self.entries)
         refuse_changed_inputs(env, self.input_keys)
         self.fallback = None if fallback is None else self._checked_fallback(fallback)
         self.eval()
@@ -196,8 +196,7 @@ class DeployedPolicy(nn.Module):
         for module in self.body:
             keys += [key for key in module.in_keys if key not in written]
             written |= set(module.out_keys)
-        outer = [k for k in keys if not (isinstance(k, tuple) and k[0] == CONSTRAINTS_KEY)]
-        return list(dict.fromkeys(outer))
+        return keys
 
 
 def _geometries(env: EnvBase, order: Sequence[str]) -> list[GeometryTransform]:

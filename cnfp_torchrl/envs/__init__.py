@@ -15,6 +15,7 @@ from cnfp_torchrl.envs.cost import (
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
 from cnfp_torchrl.envs.observed import (
     ObservedEntry,
+    leaf_specs,
     observed_entries,
     refuse_changed_inputs,
 )
@@ -87,6 +88,7 @@ __all__ = [
     "counted_constraints",
     "environment_layers",
     "find_task_view",
+    "leaf_specs",
     "numbered_components",
     "observed_entries",
     "refuse_changed_inputs",

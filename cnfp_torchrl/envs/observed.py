@@ -12,6 +12,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import CatTensors, EnvBase, Transform
 
 from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.keys import CONSTRAINTS_KEY
 from cnfp_torchrl.modules import appended_transforms
 
 
@@ -29,9 +30,9 @@ class ObservedEntry:
     spec: TensorSpec
     parts: tuple[ObservedEntry, ...] = ()
 
-    def leaves(self) -> Iterable[ObservedEntry]:
-        """Return the entries that are observed themselves."""
-        return (leaf for part in self.parts for leaf in part.leaves()) if self.parts else (self,)
+    def leaf_specs(self) -> dict[NestedKey, TensorSpec]:
+        """Return the specs of the entries that are observed themselves, by their keys."""
+        return leaf_specs(self.parts) if self.parts else {self.key: self.spec}
 
     def value(self, find: Callable[[ObservedEntry], Tensor | None]) -> Tensor:
         """Return the entry's value, ``(*batch, *event)``.
@@ -56,10 +57,19 @@ def observed_entries(env: EnvBase, keys: Iterable[NestedKey]) -> list[ObservedEn
 
     Args:
         env: The environment; it is not stepped.
-        keys: The entries' keys.
+        keys: The entries' keys; those of constraints, which are not observed, are left out.
     """
     transforms = appended_transforms(env)
-    return [_entry(env, transforms, len(transforms), key) for key in dict.fromkeys(keys)]
+    return [
+        _entry(env, transforms, len(transforms), key)
+        for key in dict.fromkeys(keys)
+        if not (isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY)
+    ]
+
+
+def leaf_specs(entries: Iterable[ObservedEntry]) -> dict[NestedKey, TensorSpec]:
+    """Return the specs for one state of what is observed itself, by keys, in order."""
+    return {key: spec for entry in entries for key, spec in entry.leaf_specs().items()}
 
 
 def _entry(

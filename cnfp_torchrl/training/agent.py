@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from math import inf
 from typing import Any
 
 import torch
@@ -12,8 +9,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import nn
-from torchrl.data import Bounded
 from torchrl.envs import EnvBase, ParallelEnv, RewardSum, TransformedEnv
 from torchrl.modules import SafeProbabilisticTensorDictSequential, ValueOperator
 from torchrl.objectives import LossModule
@@ -29,19 +24,13 @@ from cnfp_torchrl.envs import (
 from cnfp_torchrl.keys import OBSERVATION_KEY
 from cnfp_torchrl.modules import (
     Flow,
-    ScaledNetwork,
-    action_bounds,
     make_constrained_actor,
     publishes_constraints,
     require_fit,
 )
 from cnfp_torchrl.objectives import SACLagrangianLoss
+from cnfp_torchrl.training.observation_scale import scaled
 from cnfp_torchrl.training.run_folder import RunFolder
-
-_LARGE = 10.0
-"""Observations beyond it are better scaled."""
-_WITHOUT_END = 1e9
-"""Bounds beyond it, such as the largest float32 of Gymnasium's, are none."""
 
 
 def build_environment(
@@ -162,49 +151,8 @@ def _made(config: DictConfig, name: str, env: TransformedEnv, *sizes: int) -> An
     """Return a network of a configuration, on the environment's device."""
     network = instantiate(config.network[name], *_sizes(env), *sizes)
     if (given := config.network.get("observation_scale")) is not None:
-        network = _scaled(network, env, given)
+        network = scaled(network, env, given)
     return network if env.device is None else network.to(env.device)
-
-
-def warn_of_large_observations(config: DictConfig, env: TransformedEnv) -> None:
-    """Warn where observations reach far beyond 1 by their spec, and nothing scales them."""
-    spec = env.observation_spec.get(OBSERVATION_KEY, None)
-    if not isinstance(spec, Bounded) or config.network.get("observation_scale") is not None:
-        return
-    reach = torch.maximum(spec.space.low.abs(), spec.space.high.abs())
-    reach = reach.reshape(-1, spec.shape[-1]).amax(0)
-    reach = torch.where(reach > _WITHOUT_END, 0.0, reach)
-    largest = float(reach.max())
-    if largest > _LARGE:
-        scale = ",".join(f"{x:.3g}" if x > 0 else "1" for x in reach.tolist())
-        warnings.warn(
-            f"observations reach {largest:.3g}, and networks learn best from numbers around 1; to "
-            f"scale what networks read, and not what geometries do: network.observation_scale="
-            f"[{scale}], or observation_scale in the task's YAML file",
-            stacklevel=2,
-        )
-
-
-def _scaled(network: nn.Module, env: TransformedEnv, given: Sequence[float]) -> nn.Module:
-    """Return a network before which observations, and actions of critics, are scaled.
-
-    Raises:
-        ValueError: when there is not one number > 0 for each component of the observation.
-    """
-    size, _ = _sizes(env)
-    scale = list(given)
-    if len(scale) != size or not all(isinstance(x, int | float) and 0 < x < inf for x in scale):
-        raise ValueError(
-            f"network.observation_scale: expected a finite number > 0 for each of the {size} "
-            f"components of the observation, given {scale}"
-        )
-    if not isinstance(network, TensorDictModule):
-        return ScaledNetwork(scale, network)
-    bounds = action_bounds(env.full_action_spec, env.action_key)
-    by_key = {OBSERVATION_KEY: scale, env.action_key: ((bounds.high - bounds.low) / 2).tolist()}
-    scales = [x for key in network.in_keys for x in by_key[key]]
-    network.module = ScaledNetwork(scales, network.module)
-    return network
 
 
 def _sizes(env: TransformedEnv) -> tuple[int, int]:

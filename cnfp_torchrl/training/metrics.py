@@ -130,7 +130,7 @@ class Metrics:
             self._log(f"{EVALUATION}score", report["score"])
         for name, count in report["violations"].items():
             if count is not None:
-                self._log(f"{EVALUATION}violations_{name}", count)
+                self._log(f"{EVALUATION}violations/{name}", count)
 
     def log_if_due(self) -> None:
         """Write an entry of the log when the interval has passed.

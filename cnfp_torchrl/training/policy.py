@@ -21,10 +21,10 @@ from cnfp_torchrl.envs import (
     GeometryTransform,
     ObservedEntry,
     appended_transforms,
+    leaf_specs,
     observed_entries,
     refuse_changed_inputs,
 )
-from cnfp_torchrl.keys import CONSTRAINTS_KEY
 from cnfp_torchrl.modules import ConstraintPublisher, flow_head, guarded
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, RunFolder
@@ -65,9 +65,8 @@ class TrainedPolicy:
             transform for transform in self._publishers if isinstance(transform, GeometryTransform)
         ]
         keys = [*(key for transform in read for key in transform.in_keys), *actor.in_keys]
-        self._entries = observed_entries(env, filter(_is_observed, keys))
-        leaves = (leaf.key for entry in self._entries for leaf in entry.leaves())
-        self.in_keys: list[NestedKey] = list(dict.fromkeys(leaves))
+        self._entries = observed_entries(env, keys)
+        self.in_keys: list[NestedKey] = list(leaf_specs(self._entries))
         """The keys of what has to be observed: of a vector that `CatTensors` makes, its parts."""
         if self._publishers:
             refuse_changed_inputs(env, self.in_keys)
@@ -141,10 +140,6 @@ def _found(observation: Mapping[Any, Any], key: NestedKey) -> Any:
     for part in key:
         found = found.get(part) if isinstance(found, Mapping) else None
     return found
-
-
-def _is_observed(key: NestedKey) -> bool:
-    return not (isinstance(key, tuple) and key[0] == CONSTRAINTS_KEY)
 
 
 def load_policy(

@@ -23,7 +23,6 @@ from cnfp_torchrl.training.agent import (
     build_actor,
     build_environment,
     training_environment,
-    warn_of_large_observations,
 )
 from cnfp_torchrl.training.callbacks import (
     RECORDING,
@@ -50,6 +49,7 @@ from cnfp_torchrl.training.interruption import (
 from cnfp_torchrl.training.interval_evaluation import IntervalEvaluation
 from cnfp_torchrl.training.learner import Learner
 from cnfp_torchrl.training.metrics import Metrics
+from cnfp_torchrl.training.observation_scale import warn_of_large_observations
 from cnfp_torchrl.training.provenance import provenance
 from cnfp_torchrl.training.run_folder import STATES, RunFolder
 from cnfp_torchrl.training.run_state import BestPolicy, RunState

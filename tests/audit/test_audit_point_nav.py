@@ -15,6 +15,7 @@ from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.envs import ConstraintAnchor, GeometryTransform, constraint_bijectors
 from cnfp_torchrl.geometry import Ball, Box
 from cnfp_torchrl.tasks.point_nav import BatteryGeometry, Layout, ObstacleGeometry, PointNavEnv
+from cnfp_torchrl.training.run_folder import BEST
 from cnfp_torchrl.visual.figures.audit import audit_figure, save_audit
 from tests.entry_points import call_command
 from tests.training.conftest import TinyRun
@@ -155,6 +156,10 @@ def test_a_trained_run_is_audited(tiny_run: TinyRun) -> None:
     assert report.subject["flow"] == "RadialFlow"
     assert report.subject["policy"] == "actor"
     assert report.flaws == []
+    (folder.path / BEST).unlink(missing_ok=True)
+    of_best = compose_config(f"run={folder.path}", f"checkpoint={BEST}", name="audit")
+    with pytest.raises(FileNotFoundError, match=f"checkpoint: expected {BEST} in"):
+        audit_configured(of_best)
 
 
 @pytest.mark.parametrize(

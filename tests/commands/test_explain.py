@@ -1,6 +1,7 @@
 """``cnfp-explain`` on a real run."""
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from cnfp_torchrl.commands.explain import explain_run, main
 from cnfp_torchrl.configuration import compose_config
 from cnfp_torchrl.training.agent import build_environment, load_actor
 from cnfp_torchrl.training.episodes import record_episode
-from cnfp_torchrl.training.run_folder import RunFolder
+from cnfp_torchrl.training.run_folder import BEST, CHECKPOINT, RunFolder
 from cnfp_torchrl.training.settings import EvaluationSettings
 from cnfp_torchrl.training.train import train
 
@@ -80,9 +81,23 @@ def test_the_command_prints_it(
     assert capsys.readouterr().out == explain_run(folder, step=7, episode=1)
 
 
+def test_the_best_policy_is_explained_where_it_is_asked_for(
+    make_run: Callable[..., RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(make_run("flow=exact").path, tmp_path / "run")
+    shutil.copy(make_run("flow=exact", "seed=1").path / CHECKPOINT, run / BEST)
+    main([str(run), "--step", "7", "--checkpoint", BEST])
+    title, _, best = capsys.readouterr().out.partition("\n")
+    assert title.endswith("stochastic policy of best.pt")
+    for seed, same in ((0, False), (1, True)):
+        folder = make_run("flow=exact", *(["seed=1"] if seed else []))
+        assert (explain_run(folder, step=7).partition("\n")[2] == best) is same
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--checkpoint", "state.pt"], "checkpoint: expected checkpoint.pt, the last policy, or"),
         (["--step", "8"], "--step: expected a number from 0 to 7, the last of episode 0, given 8"),
         (["--step", "-1"], "--step: expected a number >= 0, given -1"),
         (["--step", "0", "--episode", "-1"], "--episode: expected a number >= 0, given -1"),

@@ -27,6 +27,7 @@ def test_a_run_is_exported_and_tested(run: Path, capsys: pytest.CaptureFixture[s
     assert ", 0 violations in them" in printed.out
     assert not printed.err
     manifest = json.loads((run / "export" / "manifest.json").read_text())
+    assert manifest["checkpoint"] == "checkpoint.pt"
     assert manifest["fallback"] == [0.5, -0.5]
     assert manifest["self_test"]["states"] == 500
     assert manifest["self_test"]["violations"] == 0
@@ -40,6 +41,7 @@ def test_a_run_is_exported_and_tested(run: Path, capsys: pytest.CaptureFixture[s
 def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, words in (
         ([str(tmp_path / "nowhere")], "expected the folder of a finished run"),
+        ([str(run), "--checkpoint", "best"], "checkpoint: expected checkpoint.pt, the last"),
         ([str(run), "--states", "0"], "--states: expected a number >= 1"),
         ([str(run), "--fallback", "a,b"], "--fallback: expected numbers separated by commas"),
         ([str(run), "--fallback", "7,7"], "within the action bounds"),

@@ -7,9 +7,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry import Ball, Box, ConstraintSet, HalfSpaces, PositivePart, attempt_anchor
+from cnfp_torchrl.geometry import (
+    Ball,
+    Box,
+    ConstraintSet,
+    HalfSpaces,
+    PositivePart,
+    attempt_anchor,
+    lexicographic_anchor,
+)
 from cnfp_torchrl.geometry.anchor import chebyshev_center, row_depths
 from cnfp_torchrl.geometry.anchor.ascent import Ascent
+from cnfp_torchrl.geometry.anchor.attempts import REFINEMENT, first_attempt, stepped_attempt
 from experiments.benchmarks.anchors import random_sets
 from tests.geometry.cases import CASES, DTYPES, Case
 
@@ -91,6 +100,21 @@ def test_attempts_tell_most_random_intersections_apart() -> None:
         assert (ascent.bound >= best.slack - 1e-3 * best.slack.abs() - 1e-6)[can].all()
     assert decided_held > 0.85 * held > 200
     assert decided_empty > 0.75 * empty > 50
+
+
+def test_steps_of_compiled_code_lead_where_others_do() -> None:
+    """Taken in all states at once, and no fewer of them are decided."""
+    rng = np.random.default_rng(2)
+    most = few = 0
+    for _ in range(20):
+        sets = [s.to(torch.float32, "cpu") for s in random_sets(rng, 20)]
+        found = lexicographic_anchor(sets)
+        for steps in (0, 1, REFINEMENT):
+            anchor, _, decided = stepped_attempt(sets, None, steps)
+            torch.testing.assert_close(anchor[decided], found.anchor[decided], rtol=0, atol=1e-5)
+            assert found.active[decided].all()
+        most, few = most + int(decided.sum()), few + int(first_attempt(sets).decided.sum())
+    assert most > 1.3 * few > 60
 
 
 def test_steps_go_on_where_they_have_arrived() -> None:

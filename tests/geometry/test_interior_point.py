@@ -84,6 +84,35 @@ def test_bounds_hold_on_the_way_and_close_in(kinds: tuple[int, ...]) -> None:
     assert len(seen) < 25
 
 
+@pytest.mark.parametrize("dim", [4, 6])
+def test_steps_do_not_go_round_in_circles(dim: int) -> None:
+    """Towards ellipsoids near and beyond the boundary of a weighted L1 ball, all of 400."""
+    batch, generator = 400, torch.Generator().manual_seed(dim)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(batch, *shape, generator=generator, dtype=torch.float64)
+
+    ones = torch.ones(batch, dim, dtype=torch.float64)
+    weights, center = normal(dim), 0.6 * normal(dim)
+    reach = 1.1 ** normal() * (weights * center).abs().sum(-1)
+    tril = 0.02 * normal(dim, dim).tril(-1) + torch.diag_embed(0.05 + 0.1 * normal(dim).abs())
+    intersection = Intersection.of(
+        [Box(-ones, ones), Ellipsoid(center, tril), WeightedL1Ball(weights, 0.8 * reach)]
+    )
+    counts = np.ones((batch, 2 * dim + 2), dtype=bool)
+    maximized = counts & (np.arange(2 * dim + 2) == 2 * dim)
+    asked = []
+
+    def watched(lower: Array, upper: Array, index: Index) -> Flags:
+        asked.append(len(index))
+        return close(lower, upper, index)
+
+    best = intersection.maximize(5e-5 * counts, maximized, counts, np.zeros((batch, dim)), watched)
+    assert (best.upper_bound - best.slack).max() <= 1e-6
+    assert (best.slack < 0).mean() > 0.5
+    assert len(asked) < 25
+
+
 def test_the_scaling_of_cones() -> None:
     """It makes slack and weight the same vector, and its two directions are inverse."""
     vectors = torch.randn(2, 3, 4, 5).double()

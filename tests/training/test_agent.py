@@ -15,8 +15,8 @@ from cnfp_torchrl.training.agent import (
     build_critic,
     build_environment,
     training_environment,
-    warn_of_large_observations,
 )
+from cnfp_torchrl.training.observation_scale import warn_of_large_observations
 
 
 def parallel(batch_size: list[int]) -> EnvBase:

@@ -45,7 +45,7 @@ def test_what_is_logged_is_what_the_summary_says(tiny_run: TinyRun) -> None:
         expected = [(evaluation["step"], pytest.approx(evaluation[key])) for evaluation in history]
         assert rows(folder, f"evaluation/{name}") == expected
     for name in ("obstacle", "battery"):
-        assert [value for _, value in rows(folder, f"evaluation/violations_{name}")] == [0, 0, 0, 0]
+        assert [value for _, value in rows(folder, f"evaluation/violations/{name}")] == [0, 0, 0, 0]
         assert all(evaluation["violations"][name] == 0 for evaluation in history)
     assert all(evaluation["episodes"] == 3 for evaluation in history)
 

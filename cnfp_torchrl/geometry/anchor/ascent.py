@@ -86,13 +86,17 @@ class Ascent:
             self._step(self._evaluate(slacks), slacks.least >= ENOUGH * self.upper)
         self._evaluate(self.of.slacks(self.x))
 
-    def run_until(self, steps: int, share: float, depth: Tensor) -> tuple[Tensor, ...]:
+    def run_until(
+        self, steps: int, share: float, depth: Tensor, *, reads: bool = True
+    ) -> tuple[Tensor, ...]:
         """Take steps until all points are deep enough or cannot be, and tell which are.
 
         Args:
             steps: The largest number of steps.
             share: The share of the best slack that is enough.
             depth: The least slack that is enough, ``(*batch,)``.
+            reads: Whether it is read on the host which points need more steps. Otherwise all steps
+                are taken, which move those alone, too.
 
         Returns:
             Points ``(B, d)``, upper bounds of the best slack, and whether the points are deep
@@ -111,7 +115,9 @@ class Ascent:
                 at = self._evaluate(slacks)
             deep = slacks.least >= torch.maximum(least, share * self.upper)
             done = deep | (self.upper < -least)
-            count = len(done) - int(done.sum()) if check <= steps else 0
+            count = 0 if check > steps else len(done)
+            if count and reads:
+                count -= int(done.sum())
             if not count or (2 * count <= len(done) and len(done) >= _MANY):
                 here = self.of.action(self.x).mT
                 if left is None:

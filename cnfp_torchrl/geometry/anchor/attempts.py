@@ -141,23 +141,53 @@ def further_attempt(sets: Sequence[ConstraintSet], before: Attempt, steps: int) 
     return _roomiest(bounds, sets, _bounding_box(bounds, sets), points, ascent.bound)
 
 
-def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt) -> Attempt:
+def stepped_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None, steps: int) -> Attempt:
+    """Try as `first_attempt`, then take the first steps of `refined_attempt` where they may help.
+
+    Reads no tensor on the host. States that are left undecided stay as `first_attempt` left them.
+
+    Args:
+        sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.
+        candidate: Points that may lie in all sets, ``(*batch, d)``.
+        steps: The number of steps inwards.
+    """
+    found = first_attempt(sets, candidate)
+    if not all(map(_is_described, sets)) or _is_settled_at_first(sets):
+        return found
+    depth = functools.reduce(torch.maximum, (depths.amax(-1) for depths in row_depths(sets)))
+    ascent = Ascent(sets, found.anchor, found.upper)
+    refined = Attempt(*ascent.run_until(steps, SHARE, depth, reads=False))
+    refined = refined.view(found.decided.shape)
+    is_new = (refined.decided & ~found.decided).unsqueeze(-1)
+    anchor = torch.where(is_new, refined.anchor, found.anchor)
+    return Attempt(anchor, found.upper, found.decided | refined.decided)
+
+
+def _is_settled_at_first(sets: Sequence[ConstraintSet]) -> bool:
+    """Tell whether a first attempt decides all states in which all sets hold."""
+    bounds, others = bounds_of(sets), [s for s in sets[1:] if not isinstance(s, Box)]
+    if len(others) > 1 or 1 / (1 + math.sqrt(bounds.dim)) < SHARE:
+        return False
+    return all(s.deepest_within(bounds.bounding_box()) is not None for s in others)
+
+
+def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt, depth: Tensor) -> Attempt:
     """Take steps inwards from where an attempt ended, in states that need them as many as needed.
 
     Args:
         sets: Sets of batch shapes that broadcast.
         before: The attempt to start from, ``(*batch,)``.
+        depth: The largest depth of an anchor in any row, ``(*batch,)``.
 
     Returns:
         The attempts in all states, side by side.
     """
-    largest = functools.reduce(torch.maximum, (d.amax(-1) for d in row_depths(sets)))
-    if all(map(_is_convex, sets)) and bool((before.upper < -largest).all()):
+    if all(map(_is_convex, sets)) and bool((before.upper < -depth).all()):
         return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:
         return further_attempt(sets, before, STEPS).select()
-    return Attempt(*ascent.run_until(REFINEMENT, SHARE, largest))
+    return Attempt(*ascent.run_until(REFINEMENT, SHARE, depth))
 
 
 def _roomiest(

@@ -13,7 +13,6 @@ bounded over the action bounds: no bound rests on convergence.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, Self, TypeAlias
 
@@ -35,11 +34,8 @@ MAX_ITERATIONS = 60
 _LARGEST = 3.0
 """The largest weight at the start of what is not maximized, where what is has one of 1 at most."""
 
-_FRACTION = 0.995
+_FRACTION = 0.98
 """The share of the way to the boundary that a step may go."""
-
-_SMALL, _MANY = 8, 64
-"""Up to this many unknowns, and from this many problems on, elimination side by side is faster."""
 
 _FEW = 8
 """The number of problems up to which it takes no longer to go on with all than with some."""
@@ -87,7 +83,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
         path = _Path.begin(problem, x)
         lower, upper, best = x[problem.dim] + START, problem.bound(), x.copy()
         proof = np.zeros_like(path.rates)
-        weights = np.empty_like(proof)
+        weights = np.zeros((len(problem.rows) + len(problem.cones), len(start)))
         undecided = np.ones(len(start), dtype=bool)
         for iteration in range(MAX_ITERATIONS + 1):
             least, above = path.bounds()
@@ -104,7 +100,7 @@ def maximize_slack(problem: Program, start: Array, settled: Settled) -> Best:
             if not count or 2 * count <= len(left) > _FEW:
                 # Until then those that are settled go on with the others, but count no more.
                 found[:, left], largest[left], bound[left] = best, lower * scale, upper * scale
-                weights[:, left] = proof / (proof * path.rates).sum(0)
+                weights[np.ix_(path.which, left)] = proof / (proof * path.rates).sum(0)
                 if not count:
                     break
                 path, left, best = path.select(undecided), left[undecided], best[:, undecided]
@@ -131,6 +127,7 @@ class _Path:
         weights: Weights of the rows, ``(M, B)``.
         duals: Weights of the cones, ``(J, 1 + k, B)``.
         dim: The number d of components of an action, after which t stands in x.
+        which: Indices of the rows and cones among the program's, ``(M + J,)``.
         slack: Slacks of the rows at x, ``(M, B)``.
         height: Slacks of the cones at x, ``(J, 1 + k, B)``.
         product: The weighted sums of all slacks, once bounds are known, ``(B,)``.
@@ -148,6 +145,7 @@ class _Path:
     weights: Array
     duals: Array
     dim: int
+    which: Index
     slack: Array
     height: Array
     product: Array
@@ -156,24 +154,28 @@ class _Path:
     def begin(cls, problem: Program, x: Array) -> Self:
         """Return the paths from points on, with weights for which these are about the best."""
         dim = problem.dim
-        rates = np.concatenate([problem.rows[:, dim], problem.cones[:, 0, dim]])
+        # Cones take most of the time, so that those that count nowhere are left out.
+        counts = problem.cones.any((1, 2, 3))
+        cones, tips = problem.cones[counts], problem.tips[counts]
+        rates = np.concatenate([problem.rows[:, dim], cones[:, 0, dim]])
         low, high = np.zeros_like(x), np.ones_like(x)
         low[:dim], high[dim + 1 :] = -1, problem.reach
         path = cls(
             rows=problem.rows,
             offsets=problem.offsets,
-            cones=problem.cones,
-            tips=problem.tips,
+            cones=cones,
+            tips=tips,
             rates=rates,
             spare=np.where(rates > 0, 0.0, np.inf),
             low=low,
             high=high,
             x=x,
             weights=problem.offsets,
-            duals=problem.tips,
+            duals=tips,
             dim=dim,
+            which=np.concatenate([np.ones(len(problem.rows), dtype=bool), counts]).nonzero()[0],
             slack=problem.offsets,
-            height=problem.tips,
+            height=tips,
             product=problem.unit,
         )
         path.move(x)
@@ -189,8 +191,8 @@ class _Path:
 
     def select(self, keep: Flags) -> Self:
         """Return some of the B paths."""
-        values = vars(self).items()
-        return type(self)(**{n: v if n == "dim" else v[..., keep] for n, v in values})
+        values, same = vars(self).items(), ("dim", "which")
+        return type(self)(**{n: v if n in same else v[..., keep] for n, v in values})
 
     def move(self, x: Array) -> None:
         """Go to points."""
@@ -231,9 +233,13 @@ class _Path:
             point = scaling.scaled(self.duals)
             mirror = _flipped(point)
             left, right = np.concatenate([left, scaled]), np.concatenate([right, scaled])
-        inverse = _inverted(left, right)
+        matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
+        # Rounding may have made a matrix singular.
+        np.einsum("bii->bi", matrix)[...] *= 1 + 1e-14
         # First a step without centering: the less it would gain, the more centering there is.
-        move = inverse[:, self.dim]
+        pull = np.zeros_like(self.x)
+        pull[self.dim] = 1
+        move = _solved(matrix, pull)
         fall = times(self.rows, move) / slack
         limit = np.maximum(fall.max(0), 1 - fall.min(0))
         if cones:
@@ -245,14 +251,13 @@ class _Path:
         far = 1 - 1 / np.maximum(limit, 1)
         center = far * far * far * self.product / (count + cones)
         aim = center / (slack * self.weights) + fall * (fall - 1)
-        pull = -_pulled(self.rows, self.weights * aim)
+        pull -= _pulled(self.rows, self.weights * aim)
         if cones:
             wanted = _product(falls, falls - point)
             wanted[:, 0] += center
             aims = _quotient(wanted, point, mirror, scaling.det)
             pull -= _pulled(scaled, _side_by_side(aims))
-        pull[self.dim] += 1
-        move = times(inverse, pull)
+        move = _solved(matrix, pull)
         fall = times(self.rows, move) / slack
         loss = 1 - aim - fall
         ahead, along = fall.max(0), loss.max(0)
@@ -261,6 +266,7 @@ class _Path:
             losses = point - aims - falls
             crossing = _crossing(mirror, scaling.det, np.stack([falls, losses]))
             limits = (sum(crossing) / scaling.det).max((0, 1))
+            # Steps of two lengths may go round in circles, without end.
             ahead = along = np.maximum(limits, np.maximum(ahead, along))
         ahead, along = (_FRACTION / np.maximum(limit, _FRACTION) for limit in (ahead, along))
         self.weights = self.weights * (1 - along * loss)
@@ -326,34 +332,16 @@ class ConeScaling(NamedTuple):
         return result / size[:, None]
 
 
-def _inverted(left: Array, right: Array) -> Array:
-    """Return the inverses ``(n, n, B)`` of products ``left^T right`` of matrices ``(m, n, B)``.
-
-    The products are symmetric and positive definite. What an inverse costs in accuracy is one
-    step's.
-    """
-    matrix = left.transpose(2, 1, 0) @ right.transpose(2, 0, 1)
-    axes = np.arange(matrix.shape[-1])
-    if len(axes) > _SMALL or len(matrix) < _MANY:
-        # Rounding may have made a matrix singular.
-        matrix[:, axes, axes] *= 1 + 1e-14
-        # Of problems that went on after they were settled, which no longer count.
-        matrix[~np.isfinite(matrix).all((1, 2))] = np.eye(len(axes))
-        with suppress(np.linalg.LinAlgError):
-            return np.ascontiguousarray(np.linalg.inv(matrix).transpose(1, 2, 0))
-    inverse = np.ascontiguousarray(matrix.transpose(1, 2, 0))
-    least = 1e-15 * inverse[axes, axes]
-    # The sweep operator (Goodnight 1979), which leaves the negative inverse.
-    for k in range(len(axes)):
-        # Where rounding made a matrix indefinite, t still grows along the direction.
-        pivot = np.maximum(inverse[k, k], least[k])
-        column = inverse[k].copy()
-        row = column / pivot
-        inverse -= column[:, None] * row
-        inverse[k] = row
-        inverse[:, k] = row
-        inverse[k, k] = -1 / pivot
-    return -inverse
+def _solved(matrix: Array, wanted: Array) -> Array:
+    """Return solutions ``(n, B)`` with matrices ``(B, n, n)``, NaN where one is singular."""
+    # Not by inverses, whose rounding error would keep bounds apart.
+    try:
+        return np.ascontiguousarray(np.linalg.solve(matrix, wanted.T[..., None])[..., 0].T)
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full_like(wanted, np.nan)
+    each = (_solved(matrix[i : i + 1], wanted[:, i : i + 1]) for i in range(len(matrix)))
+    return np.concatenate(list(each), -1)
 
 
 def _pulled(matrix: Array, weights: Array) -> Array:

@@ -40,12 +40,11 @@ class Intersection:
     plain: tuple[int, ...]
 
     @classmethod
-    def of(cls, sets: Sequence[ConstraintSet], widths: Sequence[int] | None = None) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet]) -> Self:
         """Describe sets of batch shape ``(B,)`` in any dtype, on any device.
 
         Args:
             sets: The first is the finite box of action bounds.
-            widths: The number of rows of each set; None counts them.
 
         Raises:
             GeometryError: when the first set is no finite box, or a field has NaN in it.
@@ -58,10 +57,7 @@ class Intersection:
             for name, field in constraint_set.fields().items():
                 if np.isnan(field.detach().numpy()).any():
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
-        if widths is None:
-            slacks = [s.row_slacks(bounds.low) if type(s).has_rows() else None for s in wide]
-            widths = [1 if slack is None else slack.shape[-1] for slack in slacks]
-        return cls._described(wide, tuple(widths), None)
+        return cls._described(wide, tuple(s.row_count() for s in wide), None)
 
     def near(self, point: Array) -> Self:
         """Return the intersections with the convex parts near points ``(B, d)`` in their place."""
@@ -131,7 +127,9 @@ class Intersection:
         return slacks
 
     def select(self, index: Index) -> Self:
-        """Return some of the B intersections."""
+        """Return some of the B intersections, by indices in ascending order."""
+        if len(index) == len(self.program.unit):
+            return self
         shape, at = torch.Size([len(self.program.unit)]), torch.from_numpy(index)
         # Of sets that a description tells all about nothing reads the fields any more.
         read = range(len(self.sets)) if not all(self.convex) else self.own

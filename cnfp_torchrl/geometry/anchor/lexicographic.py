@@ -26,12 +26,13 @@ from cnfp_torchrl.geometry.anchor.attempts import (
     Attempt,
     first_attempt,
     refined_attempt,
+    stepped_attempt,
 )
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
 
 LEEWAY = 1e-3
 """The amount by which rows are relaxed beyond the least one, as a share of the bounds' width.
@@ -44,6 +45,13 @@ times larger and the log-density, which the entropy weight must make up for, d l
 the log-density is some 8 d above that of the bounds, and float32's rounding is a thousandth of what
 is left.
 """
+
+
+_COMPILED_STEPS = 3
+"""The number of steps inwards that compiled code takes in all states of a small batch."""
+
+_MOST_STEPPED = 512
+"""The largest batch in which that takes less time than looking which states need them."""
 
 
 class Begun(NamedTuple):
@@ -69,10 +77,16 @@ class Begun(NamedTuple):
 def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Begun:
     """Make the attempts that take the least time, and read no tensor on the host.
 
+    In small batches compiled code takes the first steps inwards, too, which then cost little.
+
     Args:
         sets: Sets in order of application, as in `lexicographic_anchor`.
         candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
+    if torch.compiler.is_compiling():
+        count = broadcast_shape(*(s.batch_shape for s in sets)).numel()
+        if count <= _MOST_STEPPED:
+            return Begun(sets, stepped_attempt(sets, candidate, _COMPILED_STEPS))
     return Begun(sets, first_attempt(sets, candidate))
 
 
@@ -122,19 +136,25 @@ def finish_anchor(begun: Begun, leeway: float = LEEWAY) -> Anchored:
     left = (~found.decided).nonzero().squeeze(-1)
     if len(left):
         # Steps inwards for the states that need them, and the search for those that need more.
-        some = shape
-        if len(left) < len(anchor):
+        # Where these are most states, choosing them takes longer than steps in the others.
+        some, part = sets, shape
+        if 2 * len(left) < len(anchor):
             # Not action bounds that are the same for all, of which more is known.
-            sets = [s.select(shape, left) if s.batch_shape else s for s in sets]
-            some, found = left.shape, found.select(left)
-        refined = refined_attempt(sets, found.view(some))
+            some = [s.select(shape, left) if s.batch_shape else s for s in sets]
+            part, found = left.shape, found.select(left)
+        depths = [depth.expand(*part, depth.shape[-1]) for depth in row_depths(some)]
+        depth = torch.cat(depths, -1)
+        refined = refined_attempt(some, found.view(part), depth.amax(-1))
+        depth = depth.reshape(-1, depth.shape[-1])
+        if part is shape:
+            refined, depth = refined.select(left), depth[left]
         anchor = anchor.index_copy(0, left, refined.anchor)
         hard = (~refined.decided).nonzero().squeeze(-1)
-        sets = [s.select(some, hard) for s in sets] if len(hard) else sets
         found, left = refined.select(hard), left[hard]
     if len(left):
+        sets, depth = [s.select(shape, left) for s in sets], depth[hard]
         margin = leeway * bounds_of(sets).smallest_width()
-        searched = Search.of(sets, row_depths(sets), margin).run(found.anchor, found.upper)
+        searched = Search.of(sets, depth, margin).run(found.anchor, found.upper)
         anchor = anchor.index_copy(0, left, searched.anchor.to(anchor))
         active.view(-1, len(sets)).index_copy_(0, left, searched.active.to(active.device))
         # Rounded up, by as much as the sum of a large amount and a field may be rounded down.

@@ -76,10 +76,10 @@ class Search:
     # Compilers would trace NumPy's arithmetic as their own.
     @classmethod
     @torch.compiler.disable
-    def of(cls, sets: Sequence[ConstraintSet], depths: Sequence[Tensor], leeway: Tensor) -> Self:
+    def of(cls, sets: Sequence[ConstraintSet], depth: Tensor, leeway: Tensor) -> Self:
         """Return the search for sets in any dtype, on any device."""
-        numbers = (value.double().cpu().numpy() for value in (torch.cat(list(depths), -1), leeway))
-        return cls(Intersection.of(sets, [depth.shape[-1] for depth in depths]), *numbers)
+        numbers = (value.double().cpu().numpy() for value in (depth, leeway))
+        return cls(Intersection.of(sets), *numbers)
 
     @torch.compiler.disable
     def run(self, start: Tensor, upper: Tensor) -> Anchored:
@@ -159,9 +159,7 @@ class Search:
                 self.dropped[:, k] = left
                 rows = rows & ~left[:, None]
             self.counts = self.counts | rows
-        rooms = self.slacks - (self.depth - self.relaxation)
-        least, depth = (np.where(self.counts, v, np.inf).min(-1) for v in (rooms, self.depth))
-        left = (~_is_deep(least, self.upper, depth)).nonzero()[0]
+        left = (~self._is_deep(self.counts)).nonzero()[0]
         if len(left):
             some = self._select(left)
             some._fit(some.counts)
@@ -203,6 +201,35 @@ class Search:
             self.kept[left] = best.action + share * (self.kept[left] - best.action)
             self.slacks[left] = some.row_slacks(self.kept[left])
             self.upper[left] = np.where(gives, upper, self.upper[left])
+            if k == 1 and all(self.everything.convex):
+                self._hold_rest(left[gives])
+
+    def _hold_rest(self, index: Index) -> None:
+        """Move to points well inside of all rows, where what has given way so far is enough.
+
+        Args:
+            index: Indices of states in which rows have just given way.
+        """
+        undecided = ~self.far[index]
+        for k in range(len(self.everything.sets)):
+            undecided[:, self.everything.rows_of(k)] &= ~self.dropped[index, k, None]
+        rows = np.zeros_like(self.counts)
+        rows[index] = undecided
+        left = index[~self._is_deep(rows)[index]]
+        if not len(left):
+            return
+        some = self._select(left)
+        found = some._roomiest(some.everything, rows[left])
+        fits = found.slack >= 0
+        left = left[fits]
+        self.kept[left], self.upper[left] = found.action[fits], found.upper_bound[fits]
+        self.slacks[left] = some.everything.row_slacks(found.action)[fits]
+
+    def _is_deep(self, rows: Flags) -> Flags:
+        """Tell where points have a large share of the best slack in some rows."""
+        rooms = self.slacks - (self.depth - self.relaxation)
+        least, depth = (np.where(rows, v, np.inf).min(-1) for v in (rooms, self.depth))
+        return _is_deep(least, self.upper, depth)
 
     def _fit(self, rows: Flags) -> Flags:
         """Move to points well inside of some rows where there are such, and tell where.

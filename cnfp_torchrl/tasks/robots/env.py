@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import CatTensors, EnvBase, TransformedEnv
 
 from cnfp_torchrl.envs import PreviousAction, TaskView
 from cnfp_torchrl.keys import PREVIOUS_ACTION_KEY, refuse_non_finite
@@ -37,8 +37,6 @@ class RobotEnv(EnvBase):
         robot: The id of a Gymnasium environment of MuJoCo, such as ``HalfCheetah-v5``.
         batch_size: The shape of the batch of robots, which are independent of each other.
         judges: Judges of the constraints by their names.
-        observes_action: Whether the motors' last action, 0 after a reset, is appended to the
-            observation.
         max_steps: The length at which an episode is truncated; None takes Gymnasium's.
         seed: The seed of the starts; None takes one from torch's global generator.
 
@@ -53,14 +51,13 @@ class RobotEnv(EnvBase):
         batch_size: Sequence[int] = (),
         *,
         judges: Mapping[str, Judge] | None = None,
-        observes_action: bool = False,
         max_steps: int | None = None,
         seed: int | None = None,
     ) -> None:
         if any(size < 1 for size in batch_size):
             raise ValueError(f"batch_size: expected sizes >= 1, given {tuple(batch_size)}")
         super().__init__(device="cpu", batch_size=torch.Size(batch_size))
-        self.judges, self.observes_action = dict(judges or {}), observes_action
+        self.judges = dict(judges or {})
         self.constraint_names = tuple(self.judges)
         self.robots = [
             gymnasium.make(robot, max_episode_steps=max_steps, disable_env_checker=True)
@@ -98,9 +95,8 @@ class RobotEnv(EnvBase):
         assert isinstance(actions, gymnasium.spaces.Box)
         assert space.shape is not None
         data = robot.unwrapped.data  # type: ignore[attr-defined]
-        width = space.shape[-1] + self.observes_action * data.ctrl.size
         self.observation_spec = Composite(
-            observation=Unbounded((*batch, width), dtype=torch.float32),
+            observation=Unbounded((*batch, space.shape[-1]), dtype=torch.float32),
             qpos=Unbounded((*batch, data.qpos.size), dtype=torch.float64),
             qvel=Unbounded((*batch, data.qvel.size), dtype=torch.float64),
             shape=batch,
@@ -161,11 +157,8 @@ class RobotEnv(EnvBase):
 
     def _observed(self, shown: Sequence[np.ndarray]) -> dict[str, Tensor]:
         datas = [robot.unwrapped.data for robot in self.robots]  # type: ignore[attr-defined]
-        rows = list(shown)
-        if self.observes_action:
-            rows = [np.append(row, data.ctrl) for row, data in zip(rows, datas, strict=True)]
         columns = {
-            "observation": np.stack(rows).astype(np.float32),
+            "observation": np.stack(shown).astype(np.float32),
             "qpos": np.stack([data.qpos for data in datas]),
             "qvel": np.stack([data.qvel for data in datas]),
         }
@@ -188,12 +181,13 @@ class RobotView(TaskView):
 def robot_with_previous_action(
     robot: str, batch_size: Sequence[int] = (), **kwargs: Any
 ) -> TransformedEnv:
-    """Return a `RobotEnv` that observes its previous action and publishes it beside that.
+    """Return a `RobotEnv` that publishes its previous action, also at the observation's end.
 
     Args:
         robot: See `RobotEnv`.
         batch_size: See `RobotEnv`.
         kwargs: Further options of `RobotEnv`.
     """
-    env = RobotEnv(robot, batch_size, observes_action=True, **kwargs)
-    return TransformedEnv(env, PreviousAction())
+    env = TransformedEnv(RobotEnv(robot, batch_size, **kwargs), PreviousAction())
+    parts = ["observation", PREVIOUS_ACTION_KEY]
+    return env.append_transform(CatTensors(parts, "observation", del_keys=False, sort=False))

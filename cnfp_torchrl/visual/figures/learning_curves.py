@@ -30,7 +30,7 @@ RELAXATIONS = {
 }
 """What is logged of constraints that gave way: one panel each, where it ever was more than 0."""
 
-JUDGED = "evaluation/violations_"
+JUDGED = "evaluation/violations/"
 """Of each constraint, the violating steps in an evaluation during training."""
 
 _LOSSES = {"qvalue": "critic", "alpha": "α"}

@@ -16,6 +16,15 @@ from cnfp_torchrl.visual.rerun import entities, style
 from cnfp_torchrl.visual.scene import Scene
 from cnfp_torchrl.visual.setting import Setting
 
+_METRICS_OF_EACH_CONSTRAINT = (
+    "violations/",
+    "evaluation/violations/",
+    "train/lambda_",
+    "relaxed/",
+    "dropped/",
+    "relaxation/",
+)
+
 
 @dataclass(frozen=True)
 class Plot:
@@ -143,7 +152,7 @@ class SeriesPainter:
                 lines = rr.SeriesLines(colors=colors, names=names, widths=[2.0] * len(curves))
                 self._stream.log(path, lines, static=True)
         for name, color in self._setting.colors.items():
-            for metric in ("violations/", "train/lambda_", "relaxed/", "dropped/", "relaxation/"):
+            for metric in _METRICS_OF_EACH_CONSTRAINT:
                 line = rr.SeriesLines(colors=rgb(color), names=name)
                 path = rr.new_entity_path([style.METRICS, *f"{metric}{name}".split("/")])
                 self._stream.log(path, line, static=True)

@@ -2,6 +2,8 @@
 
 import math
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,6 +17,7 @@ from cnfp_torchrl.configuration import compose_config, config_directory
 from cnfp_torchrl.modules import flow_head
 from cnfp_torchrl.tasks.robots import PowerLimit, RateLimit, RobotEnv, robot_with_previous_action
 from cnfp_torchrl.training.agent import build_actor, build_environment
+from cnfp_torchrl.training.policy import TrainedPolicy
 
 TASKS = sorted(
     path.stem
@@ -87,6 +90,19 @@ def test_the_audit_finds_no_flaw_and_full_coverage(task: str) -> None:
     for source in report.as_dict()["sources"].values():
         for kind in ("unsound", "escaped", "dead_ends"):
             assert source["together"][kind]["count"] == 0
+
+
+def test_a_policy_takes_what_gymnasium_shows_and_the_previous_action() -> None:
+    env, actor = environment("hopper_rate", 1)
+    policy = TrainedPolicy(actor, env)
+    assert set(policy.in_keys) == {"observation", "previous_action"}
+    shown, _ = gymnasium.make("Hopper-v5").reset(seed=0)
+    before = np.full(3, 0.9, dtype=np.float32)
+    action = policy({"observation": shown, "previous_action": before})
+    assert (np.abs(action - before) <= [0.2, 0.5, 0.5]).all()
+    whole = np.concatenate([shown, before])
+    same = policy({"observation": whole, "previous_action": before})
+    np.testing.assert_array_equal(action, same)
 
 
 def test_robots_start_and_end_apart() -> None:

@@ -131,7 +131,7 @@ def test_violations_in_evaluations_are_told_from_those_of_training() -> None:
     steps = np.array([10.0, 20.0])
     evaluated = {"wall": np.zeros(2), "power": np.array([3.0, 1.0])}
     curves = {"violations/wall": (steps, np.array([5.0, 9.0])), "evaluation/score": (steps, steps)}
-    curves |= {f"evaluation/violations_{name}": (steps, v) for name, v in evaluated.items()}
+    curves |= {f"evaluation/violations/{name}": (steps, v) for name, v in evaluated.items()}
     _, training, evaluation, score = learning_curves(curves).axes
     assert "training" in training.get_title()
     for axes in (evaluation, score):

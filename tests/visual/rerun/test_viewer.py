@@ -97,8 +97,9 @@ def test_point_navigation(viewer: ViewerClient, tmp_path: Path) -> None:
             flow_stream.log_step(step, transition)
             for name in ("train/return", "loss/actor", "train/alpha", "train/entropy"):
                 logger.log_scalar(name, float(step), step=step)
-            for name in ("violations/battery", "violations/obstacle"):
-                logger.log_scalar(name, 0.0, step=step)
+            for name in ("battery", "obstacle"):
+                logger.log_scalar(f"violations/{name}", 0.0, step=step)
+                logger.log_scalar(f"evaluation/violations/{name}", 0.0, step=step)
     views = opened(viewer, path, STEPS - 1)
     assert sorted(view.name for view in views) == sorted(
         [
