@@ -11,7 +11,7 @@ from torch.distributions import Distribution, Independent, Normal, TransformedDi
 from torch.distributions.utils import _standard_normal
 
 from cnfp_torchrl.bijectors import Bijector, Stages, has_latent, well_inside
-from cnfp_torchrl.geometry import broadcast_shape
+from cnfp_torchrl.geometry import broadcast_shape, component_sum
 from cnfp_torchrl.keys import refuse_non_finite
 
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
@@ -300,7 +300,7 @@ def _rsample_and_log_prob(base: Distribution, shape: torch.Size) -> tuple[Tensor
         return latent, base.log_prob(latent)
     loc, scale = gaussian.loc, gaussian.scale
     noise = _standard_normal((*shape, *loc.shape), dtype=loc.dtype, device=loc.device)
-    surprise = torch.addcmul(scale.log(), noise, noise, value=0.5).sum(-1)
+    surprise = component_sum(torch.addcmul(scale.log(), noise, noise, value=0.5))
     constant = -0.5 * math.log(2 * math.pi) * loc.shape[-1]
     return torch.addcmul(loc, scale, noise), constant - surprise
 

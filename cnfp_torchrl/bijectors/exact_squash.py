@@ -21,6 +21,7 @@ from cnfp_torchrl.geometry import (
     ConstraintSet,
     Gauge,
     Region,
+    component_sum,
     require_action_bounds,
 )
 
@@ -160,7 +161,7 @@ class _Retraction:
         scaled, contraction, factors = self._scaled_and_contraction(offset)
         if factors is not None:
             log_slopes = log_slopes + factors.log()
-        log_det = log_slopes.sum(-1)
+        log_det = component_sum(log_slopes)
         if contraction is not None:
             log_det = torch.sub(log_det, contraction.log(), alpha=offset.shape[-1])
         return self._contracted(scaled, contraction), log_det

@@ -23,6 +23,7 @@ from cnfp_torchrl.geometry import (
     ConstraintSet,
     Ellipsoid,
     GeometryError,
+    component_sum,
     power_of_two,
     require_action_bounds,
 )
@@ -100,7 +101,7 @@ class BoxSquash(Bijector):
 
     def forward_and_log_det(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         action, log_slopes = self.forward_and_log_slopes(latent)
-        return action, log_slopes.sum(-1)
+        return action, component_sum(log_slopes)
 
     def inverse_and_log_det(self, action: Tensor) -> tuple[Tensor, Tensor]:
         latent = ((action - self._middle) / self._half).atanh()

@@ -33,7 +33,7 @@ from cnfp_torchrl.geometry.constraint_set import (
     largest_value,
 )
 from cnfp_torchrl.geometry.half_spaces import HalfSpaces
-from cnfp_torchrl.geometry.norms import length, power_of_two
+from cnfp_torchrl.geometry.norms import component_sum, length, power_of_two
 from cnfp_torchrl.geometry.projection import project, project_onto_intersection, settled
 from cnfp_torchrl.geometry.region import Region, scaled_direction
 from cnfp_torchrl.geometry.superlevel import Cone, KinkedSum, Rows, Superlevel
@@ -69,6 +69,7 @@ __all__ = [
     "begin_anchor",
     "broadcast_shape",
     "chebyshev_center",
+    "component_sum",
     "extremes",
     "finish_anchor",
     "gauge_of_sides",

@@ -18,7 +18,7 @@ from cnfp_torchrl.geometry.constraint_set import (
     Gauge,
     largest_value,
 )
-from cnfp_torchrl.geometry.norms import length, power_of_two, spectral_norm_bound
+from cnfp_torchrl.geometry.norms import component_sum, length, power_of_two, spectral_norm_bound
 from cnfp_torchrl.geometry.superlevel import Cone
 
 MOST_SKEWED = 1e15
@@ -82,7 +82,7 @@ class Ball(ConstraintSet):
         """Return the size of the numbers whose rounding errors add up, ``(*batch,)``."""
         # Not the center's length, which needs a unit that its squares are in range in; and not
         # `torch.linalg.vector_norm`, whose sums take ten times as long.
-        return self.radius + self.center.abs().sum(-1)
+        return self.radius + component_sum(self.center.abs())
 
     def around(self, center: Tensor, radius: Tensor) -> Self:
         return type(self)(center, radius.expand(center.shape[:-1]), validate_args=False)
@@ -357,8 +357,8 @@ def ball_gauge_about(offset: Tensor, radius: Tensor, unit: Tensor | None = None)
 
 
 def _ball_gauge(scaled_offset: Tensor, inverse: Tensor, scale: Tensor, direction: Tensor) -> Tensor:
-    beta = (direction * scaled_offset).sum(-1)
-    q = direction.square().sum(-1) * inverse
+    beta = component_sum(direction * scaled_offset)
+    q = component_sum(direction * direction) * inverse
     ahead = beta.relu()
     h = torch.add(torch.addcmul(q, beta, beta).sqrt(), ahead, alpha=2) - beta
     return torch.add(q / h, ahead, alpha=2) * scale

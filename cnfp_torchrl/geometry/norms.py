@@ -1,10 +1,30 @@
-"""Norms that neither overflow nor underflow where the dtype can hold the result."""
+"""Norms that neither overflow nor underflow where the dtype can hold the result, and sums."""
 
 from __future__ import annotations
+
+from functools import reduce
 
 import torch
 from torch import Tensor
 from torch.linalg import vector_norm
+
+_MANY = 4096
+"""The size from which on adding few components takes less time than `torch.sum` of them."""
+
+
+def component_sum(values: Tensor) -> Tensor:
+    """Return the sum over the last dimension, ``(*batch,)``.
+
+    `torch.sum` adds up rows of two or three numbers one by one, in three times the time at large
+    batches; at small ones its gradient is faster.
+
+    Args:
+        values: Values of the components, ``(*batch, d)``.
+    """
+    is_slow = 1 < values.shape[-1] <= 3 and not torch.compiler.is_compiling()
+    if is_slow and values.numel() >= _MANY:
+        return reduce(torch.add, values.unbind(-1))
+    return values.sum(-1)
 
 
 def power_of_two(size: Tensor) -> Tensor:

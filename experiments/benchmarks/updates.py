@@ -8,7 +8,8 @@ width 64 and 256:
   actor, of Stable-Baselines3's unconstrained SAC, and the matrix products of such an update alone;
 - whole training in steps a second, 16 agents and half an update a step, after the warm-up: the
   exact flow and the unconstrained actor in `cnfp_torchrl.training`, and Stable-Baselines3's SAC
-  with 16 environments of the same task in its vectorized environment.
+  with 16 environments of the same task in its vectorized environment; with ``--compiled``, ours
+  compiled as well, and the steps after which the time of compiling is paid back.
 
 In a round all take their turn, so that another program's load falls on all of them; of updates the
 process's own time on the processor counts, which waiting for one does not prolong. Reported are
@@ -25,12 +26,12 @@ import platform
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from hydra.utils import instantiate
@@ -167,27 +168,38 @@ def time_updates(width: int, rounds: int, repeats: int, *, compiled: bool) -> Ro
     return times
 
 
-def our_training(flow: str, width: int, warmup: int, frames: int) -> float:
-    """Return the steps a second of a run after its warm-up, evaluation apart."""
+class Run(NamedTuple):
+    """The speed of a training run once it is under way, and the time that it took until then."""
+
+    steps_per_second: float
+    seconds_before: float
+
+
+def our_training(flow: str, width: int, warmup: int, frames: int, *, compiled: bool) -> Run:
+    """Return the time of a run from twice its warm-up on, evaluation apart.
+
+    By then all has been compiled: updates at the end of the warm-up, the policy at the next step.
+    """
     with tempfile.TemporaryDirectory() as folder:
         config = composed(
             flow,
             width,
             f"training.warmup_frames={warmup}",
-            f"training.log_interval={AGENTS}",
-            f"collector.total_frames={warmup + frames}",
+            f"training.log_interval={warmup}",
+            f"collector.total_frames={2 * warmup + frames}",
             "evaluation.episodes=1",
             "+env.base.max_steps=100",
             "logger=csv",
             "figures=none",
+            f"compile={str(compiled).lower()}",
         )
         path = Path(folder) / "run"
         train(config, RunFolder.create(path))
         with (path / "metrics" / "scalars" / "train" / "seconds.csv").open() as file:
             rows = [(int(step), float(seconds)) for step, seconds in csv.reader(file)]
-    # The entry at the warm-up's end comes after its last step, and after that step's updates.
-    (first, started), (last, ended) = next(row for row in rows if row[0] >= warmup), rows[-1]
-    return (last - first) / (ended - started)
+    # An entry comes after its last step, and after that step's updates.
+    (first, started), (last, ended) = next(row for row in rows if row[0] >= 2 * warmup), rows[-1]
+    return Run((last - first) / (ended - started), started)
 
 
 def reference_training(width: int, warmup: int, frames: int) -> float:
@@ -209,14 +221,38 @@ def reference_training(width: int, warmup: int, frames: int) -> float:
     return (model.num_timesteps - first) / (time.perf_counter() - started)
 
 
-def time_training(width: int, rounds: int, warmup: int, frames: int) -> Rounds:
-    """Return the steps a second of each kind of training in each round."""
-    speeds: Rounds = {name: [] for name in (*FLOWS, REFERENCE)}
+def time_training(
+    width: int, rounds: int, warmup: int, frames: int, *, compiled: bool
+) -> tuple[Rounds, dict[str, float]]:
+    """Return the steps a second of each kind of training in each round, and seconds of compiling.
+
+    Those are of the first round, in which nothing has been compiled before: the time until a
+    compiled run is under way, less that of an eager one.
+    """
+    speeds: Rounds = {}
+    compiling: dict[str, float] = {}
     for _ in range(rounds):
         for name, flow in FLOWS.items():
-            speeds[name].append(our_training(flow, width, warmup, frames))
-        speeds[REFERENCE].append(reference_training(width, warmup, frames))
-    return speeds
+            eager = our_training(flow, width, warmup, frames, compiled=False)
+            speeds.setdefault(name, []).append(eager.steps_per_second)
+            if compiled:
+                torch.compiler.reset()
+                run = our_training(flow, width, warmup, frames, compiled=True)
+                speeds.setdefault(f"{name}, compiled", []).append(run.steps_per_second)
+                compiling.setdefault(name, run.seconds_before - eager.seconds_before)
+        speeds.setdefault(REFERENCE, []).append(reference_training(width, warmup, frames))
+    return speeds, compiling
+
+
+def payback(measured: Rounds, compiling: dict[str, float]) -> list[str]:
+    """Return by how many steps compiled training has made up for compiling, in sentences."""
+    sentences = []
+    for name, seconds in compiling.items():
+        eager, compiled = median(measured[name]), median(measured[f"{name}, compiled"])
+        steps = seconds / (1 / eager - 1 / compiled)
+        end = f"is paid back after {steps:,.0f} steps" if steps > 0 else "is never paid back"
+        sentences.append(f"Compiling the {name} took {seconds:.0f} s, which {end}.")
+    return sentences
 
 
 def summary(measured: Rounds) -> dict[str, dict[str, float]]:
@@ -246,21 +282,24 @@ def main() -> None:
     parser.add_argument("--widths", type=int, nargs="+", default=[64, 256])
     parser.add_argument("--rounds", type=int, default=7, help="of training; updates take 9 times")
     parser.add_argument("--frames", type=int, default=1600, help="steps of a training run")
-    parser.add_argument("--compiled", action="store_true", help="also compiled updates: minutes")
+    parser.add_argument("--compiled", action="store_true", help="also compiled ones: minutes")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
+    # What was compiled before would not be compiled now.
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
     widths, rounds, repeats, frames = arguments.widths, arguments.rounds, 10, arguments.frames
     if arguments.quick:
         widths, rounds, repeats, frames = [8], 2, 1, 2 * AGENTS
     results: dict[str, dict[str, Any]] = {}
     load = {"before": os.getloadavg()}
 
-    def keep(title: str, unit: str, measured: Rounds) -> None:
+    def keep(title: str, unit: str, measured: Rounds, remarks: Sequence[str] = ()) -> None:
         # After each part: what was measured is not lost when the next one is interrupted.
         count = len(measured[REFERENCE])
-        results[title] = {"unit": unit, "rounds": count, "rows": summary(measured)}
+        rows = summary(measured)
+        results[title] = {"unit": unit, "rounds": count, "rows": rows, "remarks": list(remarks)}
         load[f"after {title}"] = os.getloadavg()
         write(arguments.output, results, load)
 
@@ -270,8 +309,11 @@ def main() -> None:
                 times = time_updates(width, 9 * rounds, repeats, compiled=arguments.compiled)
                 keep(f"update, batch {BATCH}, width {width}", "ms", times)
             else:
-                speeds = time_training(width, rounds, 10 * AGENTS, frames)
-                keep(f"training, {AGENTS} agents, width {width}", "steps/s", speeds)
+                speeds, compiling = time_training(
+                    width, rounds, 10 * AGENTS, frames, compiled=arguments.compiled
+                )
+                title = f"training, {AGENTS} agents, width {width}"
+                keep(title, "steps/s", speeds, payback(speeds, compiling))
     print((arguments.output / "updates.md").read_text())
 
 
@@ -297,6 +339,7 @@ def write(folder: Path, results: dict[str, dict[str, Any]], load: dict[str, Any]
     for title, result in results.items():
         lines += ["", f"## {title} ({result['rounds']} rounds)", ""]
         lines.append(table(result["rows"], result["unit"]))
+        lines += [line for remark in result["remarks"] for line in ("", remark)]
     (folder / "updates.md").write_text("\n".join([*lines, ""]))
 
 
