@@ -132,8 +132,7 @@ def test_transitions_are_looked_up_in_any_shape(
 ) -> None:
     buffer, _ = filled(stream(10, 1, 4), 100, rare)
     stored = next(stream(10, 1, 4))
-    given, expected = buffer[index], stored[index]
-    assert isinstance(expected, TensorDict)
+    given, expected = (td[index] for td in (buffer, stored))
     torch.testing.assert_close(
         given.select(*expected.keys(True, True)).to_dict(), expected.to_dict(), rtol=0, atol=0
     )
