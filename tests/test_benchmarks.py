@@ -94,7 +94,7 @@ def test_anchors_are_timed_and_tabulated(tmp_path: Path) -> None:
 
 
 def test_each_line_is_measured_alone_and_tabulated(tmp_path: Path) -> None:
-    lines = ["point-nav-step", "own-step", "whole-path", "flow"]
+    lines = ["point-nav-step", "own-step", "tight-step", "whole-path", "flow"]
     run("lines", "--line", *lines, "--out", tmp_path)
     for line in lines:
         path = tmp_path / f"lines_{line.replace('-', '_')}.json"

@@ -5,6 +5,8 @@ thread, and each line anew in a minute or so:
 
 - point-nav-step: point navigation's step, constrained beside plain, at several batch sizes;
 - own-step: the same of a particle with a user's own ball and two half-spaces, and no safe action;
+- tight-step: the same with a ball and a slanted half-space, of which one in 16 states is so tight
+  that its anchor takes steps inwards;
 - whole-path: network, distribution, environment, geometry and anchor, beside an unconstrained
   `TanhNormal` in the plain environment, of both;
 - flow: constructing the exact flow, drawing and scoring, beside a `TanhNormal` that is constructed
@@ -138,12 +140,36 @@ class BrakeAtWalls(GeometryTransform):
         return HalfSpaces(normals, 4 * (1 - position) - 6 * speed, validate_args=False)
 
 
+class SlowTurns(GeometryTransform):
+    """A ball: the next speed is small beside what the actions may add."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> Ball:
+        speed = tensordict["observation"][..., 2:]
+        return Ball(-3 * speed, torch.full_like(speed[..., 0], 1.2), validate_args=False)
+
+
+class BrakeOutwards(GeometryTransform):
+    """A half-space: a barrier at a circle."""
+
+    def constraint_set(self, tensordict: TensorDictBase) -> HalfSpaces:
+        position = tensordict["observation"][..., :2]
+        room = 1 - position.norm(dim=-1, keepdim=True)
+        return HalfSpaces(position.unsqueeze(-2), room, validate_args=False)
+
+
+OWN: dict[str, tuple[type[GeometryTransform], ...]] = {
+    "own": (SpeedLimit, BrakeAtWalls),
+    "tight": (SlowTurns, BrakeOutwards),
+}
+"""The constraints of a particle, by the task's name."""
+
+
 def environments(
     task: str, agents: int, *, compile: bool = False
 ) -> tuple[EnvBase, TransformedEnv]:
     """Return the plain and the constrained environment of a task."""
-    if task == "own":
-        limits = SpeedLimit("speed"), BrakeAtWalls("walls")
+    if task in OWN:
+        limits = [kind(kind.__name__) for kind in OWN[task]]
         return Particle(agents), constrain_env(Particle(agents), *limits, compile=compile)
     plain, base = (PointNavEnv([agents], seed=0) for _ in range(2))
     return plain, constrain_env(base, BatteryGeometry(), ObstacleGeometry(), compile=compile)
@@ -163,7 +189,7 @@ def time_steps(task: str, batches: list[int], settings: Settings) -> dict[str, R
         plain, env = environments(task, agents)
         actor = make_constrained_actor(network(env), env)
         recorded = env.rollout(STEPS, actor, break_when_any_done=False)
-        start = {} if task == "own" else point_nav_start(recorded)
+        start = {} if task in OWN else point_nav_start(recorded)
         calls: dict[str, Call] = {
             "plain": Replay(plain, recorded, start),
             "constrained": Replay(env, recorded, start),
@@ -293,6 +319,7 @@ def time_flow(settings: Settings) -> dict[str, Rows]:
 LINES: dict[str, Callable[[Settings], dict[str, Rows]]] = {
     "point-nav-step": partial(time_steps, "point navigation", [1, 16, 256, 4096]),
     "own-step": partial(time_steps, "own", [1, 16, 256, 4096, 65536]),
+    "tight-step": partial(time_steps, "tight", [1, 16, 256, 4096]),
     "whole-path": time_whole_path,
     "flow": time_flow,
 }

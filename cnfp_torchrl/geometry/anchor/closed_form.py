@@ -58,38 +58,28 @@ def _best_over_box(problem: Program, start: Array) -> Best:
     highs = np.where(single[:, None] & (rows > 0), crossing, np.inf)
     lows = np.where(single[:, None] & (rows < 0), crossing, -np.inf)
     low, high = lows.max(0), highs.min(0)
-    near = (start.T - problem.middle) / problem.half
-    most = [offsets - np.minimum(rows * low, rows * high).sum(1)]
-    nearest = np.empty((len(problem.cones), dim, len(start)))
-    for i, (cone, tip) in enumerate(zip(problem.cones, problem.tips, strict=True)):
+    near = np.clip((start.T - problem.middle) / problem.half, low, high)
+    # The best points of each inequality, and its slack's gradients there.
+    points = np.where(rows > 0, low, np.where(rows < 0, high, near))
+    most, gradients = offsets - (rows * points).sum(1), -rows
+    for cone, tip in zip(problem.cones, problem.tips, strict=True):
         # Separable where the matrix is diagonal, as a ball's.
-        slope, rest = cone[1:, :dim], cone[1:, :dim].copy()
+        slope, point, rest = cone[1:, :dim], near.copy(), cone[1:, :dim].copy()
         axes = np.arange(min(rest.shape[:2]))
-        rest[axes, axes] = 0
         diagonal = slope[axes, axes]
+        rest[axes, axes] = 0
         wanted = np.where(diagonal == 0, near[axes], tip[1 + axes] / diagonal)
-        nearest[i] = near
-        nearest[i, axes] = np.clip(wanted, low[axes], high[axes])
-        away = tip[1:] - (slope * nearest[i]).sum(1)
-        separable = ~rest.any((0, 1))
-        most.append(np.where(separable, tip[0] - np.sqrt(np.square(away).sum(0)), np.inf)[None])
-    bounds = np.where(rates > 0, np.concatenate(most), np.inf)
-    decides = bounds.argmin(0)
-    upper = bounds[decides, batch]
-    # The slack's gradient at the point, by which the sides of the box count.
-    is_row = decides < len(rows)
-    row = rows[np.where(is_row, decides, 0), :, batch].T
-    corner = np.where(row > 0, low, np.where(row < 0, high, np.clip(near, low, high)))
-    point, gradient = corner, -row
-    if len(problem.cones):
-        which = np.where(is_row, 0, decides - len(rows))
-        point = np.where(is_row, corner, nearest[which, :, batch].T)
-        slope = np.moveaxis(problem.cones[which, 1:, :dim, batch], 0, -1)
-        away = problem.tips[which, 1:, batch].T - (slope * point).sum(1)
+        point[axes] = np.clip(wanted, low[axes], high[axes])
+        away = tip[1:] - (slope * point).sum(1)
         length = np.sqrt(np.square(away).sum(0))
         pull = (slope * away[:, None]).sum(0) / np.where(length > 0, length, 1)
-        gradient = np.where(is_row, gradient, pull)
-    x = problem.at(np.ascontiguousarray((problem.middle + problem.half * point).T))
+        slack = np.where(rest.any((0, 1)), np.inf, tip[0] - length)
+        points, gradients = (np.concatenate(v) for v in ((points, [point]), (gradients, [pull])))
+        most = np.concatenate([most, [slack]])
+    bounds = np.where(rates > 0, most, np.inf)
+    decides = bounds.argmin(0)
+    upper = bounds[decides, batch]
+    x, gradient = problem.lifted(points[decides, :, batch].T), gradients[decides, :, batch].T
     rooms = problem.rooms(x)
     slack = rooms[decides, batch]
     others = np.where(rates > 0, rooms - slack - _APART, rooms + _ROUNDING)
@@ -97,6 +87,7 @@ def _best_over_box(problem: Program, start: Array) -> Best:
     slack = np.where((others >= 0).all(0), slack, -np.inf)
     weights = np.zeros_like(rates)
     weights[decides, batch] = 1
+    # Sides of the box count by the gradient.
     side = np.where(gradient > 0, highs.argmin(0), lows.argmax(0))
     steepness = rows[side, np.arange(dim)[:, None], batch]
     weights[side, batch] += np.where(gradient == 0, 0.0, np.abs(gradient / steepness))

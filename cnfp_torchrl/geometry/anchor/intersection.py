@@ -55,7 +55,7 @@ class Intersection:
             raise GeometryError("sets[0]: expected a finite Box of action bounds")
         for i, constraint_set in enumerate(wide):
             for name, field in constraint_set.fields().items():
-                if np.isnan(field.detach().numpy()).any():
+                if np.isnan(field.detach().numpy().min(initial=np.inf)):
                     raise GeometryError(f"sets[{i}], field '{name}': expected numbers, given NaN")
         return cls._described(wide, tuple(s.row_count() for s in wide), None)
 

@@ -173,8 +173,12 @@ class Program:
 
     def at(self, action: Array) -> Array:
         """Return x ``(n, B)`` at actions ``(B, d)``, with a slack of 0 and exact terms of sums."""
+        return self.lifted((action.T - self.middle) / self.half)
+
+    def lifted(self, point: Array) -> Array:
+        """Return what `at` does, from actions in half widths about the middle, ``(d, B)``."""
         x = np.zeros(self.rows.shape[1:])
-        x[: self.dim] = (action.T - self.middle) / self.half
+        x[: self.dim] = point
         if terms := len(self.reach):
             rooms = self.offsets[: 2 * terms] - times(self.rows[: 2 * terms], x)
             x[self.dim + 1 :] = np.maximum(-rooms[:terms], -rooms[terms:])

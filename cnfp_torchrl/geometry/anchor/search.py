@@ -208,13 +208,10 @@ class Search:
         """Move to points well inside of all rows, where what has given way so far is enough.
 
         Args:
-            index: Indices of states in which rows have just given way.
+            index: Indices of states in which rows of the lowest priority have just given way.
         """
-        undecided = ~self.far[index]
-        for k in range(len(self.everything.sets)):
-            undecided[:, self.everything.rows_of(k)] &= ~self.dropped[index, k, None]
-        rows = np.zeros_like(self.counts)
-        rows[index] = undecided
+        rows = self.counts.copy()
+        rows[:, self.everything.rows_of(1)] = ~self.far[:, self.everything.rows_of(1)]
         left = index[~self._is_deep(rows)[index]]
         if not len(left):
             return
