@@ -253,9 +253,10 @@ class ConstrainedFlowModule(SafeProbabilisticModule):
         return self._bounds.on(device)
 
     def _region(self, tensordict: TensorDictBase, *, validate_args: bool = False) -> Region:
+        sets = [self._bounds_beside(tensordict), *(b.get_set(tensordict) for b in self.bijectors)]
         anchor = require(tensordict, ANCHOR_KEY, _ANCHOR_REMEDY)
         return Region(
-            [self._bounds_beside(tensordict), *(b.get_set(tensordict) for b in self.bijectors)],
+            sets,
             anchor,
             self._active(tensordict),
             self._relaxation(tensordict, anchor.new_zeros(())),

@@ -231,6 +231,9 @@ def time_training(
     """
     speeds: Rounds = {}
     compiling: dict[str, float] = {}
+    # What was compiled before would not be compiled now.
+    torch.compiler.reset()
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
     for _ in range(rounds):
         for name, flow in FLOWS.items():
             eager = our_training(flow, width, warmup, frames, compiled=False)
@@ -287,8 +290,6 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    # What was compiled before would not be compiled now.
-    os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
     widths, rounds, repeats, frames = arguments.widths, arguments.rounds, 10, arguments.frames
     if arguments.quick:
         widths, rounds, repeats, frames = [8], 2, 1, 2 * AGENTS

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from tests.entry_points import ROOT, SCRIPTS, call_command
 
 AT_THE_IMPORT = """
 import os, signal, sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell has it ignored
 
 class PressesCtrlC:
     def find_spec(self, name, *_):
@@ -34,7 +37,7 @@ def test_while_it_is_imported(name: str, package: str, tmp_path: Path) -> None:
     module, _, function = SCRIPTS[name].partition(":")
     code = AT_THE_IMPORT.format(module=module, function=function, package=package)
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, "--help"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -46,6 +49,15 @@ def test_while_it_is_imported(name: str, package: str, tmp_path: Path) -> None:
     assert not done.stdout
 
 
+@pytest.fixture
+def usual_interrupt() -> Iterator[None]:
+    """Answer Ctrl-C as Python does, also where a shell has it ignored, as in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_interrupt")
 def test_while_it_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def press() -> None:
         os.kill(os.getpid(), signal.SIGINT)
