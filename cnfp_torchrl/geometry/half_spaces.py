@@ -174,8 +174,10 @@ class HalfSpaces(ConstraintSet):
         return half_spaces
 
     def _keep(self, rows: _Rows) -> None:
-        # A compiler sees by itself what is computed twice.
-        if not torch.compiler.is_compiling():
+        # A compiler sees by itself what is computed twice. Inference tensors are of no use later.
+        if torch.compiler.is_compiling():
+            return
+        if rows.normals.is_inference() == self.normals.is_inference():
             object.__setattr__(self, "_kept", rows)
 
 

@@ -55,6 +55,16 @@ def test_what_was_asked_before_changes_no_shape(case: Case) -> None:
     assert shapes(asked) == shapes(other)
 
 
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_gradients_follow_what_was_asked_in_inference_mode(case: Case) -> None:
+    sets = case.sets.with_fields(lambda field, _: field)
+    with torch.inference_mode():
+        sets.slack(case.inside)
+    action = case.inside.clone().requires_grad_()
+    sets.slack(action).sum().backward()
+    assert action.grad is not None
+
+
 @pytest.mark.parametrize("family", [WeightedL1Ball, PositivePart])
 def test_gauges_end_at_the_boundary_where_terms_vanish_together(
     family: type[WeightedL1Ball | PositivePart],
