@@ -120,11 +120,13 @@ class FusedAdam(Adam):
         )
         if any(hooks) or hasattr(self, "grad_scale") or hasattr(self, "found_inf"):
             return False
-        return all(
-            _has_plain_settings(settings)
-            and all(map(is_, settings["params"], parameters))
-            and all(map(is_, map(self.state.get, parameters), states))
-            for settings, parameters, states, *_ in groups
+        return len(self.param_groups) == len(groups) and all(
+            settings is group.settings
+            and _has_plain_settings(settings)
+            and len(settings["params"]) == len(group.parameters)
+            and all(map(is_, settings["params"], group.parameters))
+            and all(map(is_, map(self.state.get, group.parameters), group.states))
+            for settings, group in zip(self.param_groups, groups, strict=True)
         )
 
     def _looked_up(self) -> list[_Group] | None:

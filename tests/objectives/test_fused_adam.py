@@ -53,6 +53,14 @@ def with_more_parameters(optimizer: Adam, network: nn.Module, count: int) -> Non
         network.added.grad = torch.ones(2)
 
 
+def with_groups_of_another_make(optimizer: Adam, _: nn.Module, count: int) -> None:
+    first, second = optimizer.param_groups
+    if count == 3:
+        optimizer.param_groups[0] = {**first, "lr": 0.02}
+    elif count == 4:
+        first["params"].append(second["params"].pop())
+
+
 def with_a_hook(optimizer: Adam, network: nn.Module, count: int) -> None:
     def halve(*_: Any) -> None:
         for parameter in network.parameters():
@@ -90,6 +98,7 @@ def with_a_parameter_replaced(optimizer: Adam, network: nn.Module, count: int) -
         with_another_rate,
         loaded,
         with_more_parameters,
+        with_groups_of_another_make,
         with_a_hook,
         with_other_settings,
         begun_anew,
