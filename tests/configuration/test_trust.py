@@ -103,6 +103,16 @@ def test_what_may_be_named_is_defined_here_or_listed() -> None:
         assert inspect.isclass(found) or inspect.isfunction(found)
 
 
+@pytest.mark.parametrize("name", ["cnfp_torchrl.objectives.FusedAdam", "torch.optim.Adam"])
+def test_runs_go_on_with_the_optimizers_of_now_and_before(name: str) -> None:
+    content = {"optim": {"_target_": name, "lr": 1e-3, "fused": True}}
+    require_trusted(content, [], PATH, trains=True)
+    elsewhere = {"env": content["optim"]}
+    if name.startswith("torch."):
+        with pytest.raises(PermissionError, match=name):
+            require_trusted(elsewhere, [], PATH, trains=True)
+
+
 def test_what_may_be_named_takes_no_file() -> None:
     """Holds the list against new targets: their arguments are checked to be no paths as texts."""
     for name in nameable():
