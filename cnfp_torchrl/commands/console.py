@@ -30,9 +30,9 @@ def _command(name: str) -> Callable[[], None]:
         if is_usual:
             signal.signal(signal.SIGINT, leave)
         main = import_module(f"{__package__}.{name}").main
-        if is_usual:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
+            if is_usual:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
             main()
         except KeyboardInterrupt:
             if os.environ.get("HYDRA_FULL_ERROR") == "1":

@@ -248,7 +248,7 @@ def _write(
     pointers = []
     for tree, row in zip(trees, rows, strict=True):
         for dtype, shapes, widths, start, stop in blocks:
-            values = row[:, start:stop].view(dtype).split_with_sizes(widths, -1)
+            values = row[..., start:stop].view(dtype).split_with_sizes(widths, -1)
             for (key, shape), value in zip(shapes.items(), values, strict=True):
                 if len(shape) != 1:
                     value = value.unflatten(-1, shape) if shape else value.squeeze(-1)

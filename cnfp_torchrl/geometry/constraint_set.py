@@ -186,6 +186,11 @@ class ConstraintSet(ABC):
         return cls.inflated is not ConstraintSet.inflated
 
     @classmethod
+    def is_convex(cls) -> bool:
+        """Tell whether the family's sets are convex: it states no `part_near`."""
+        return cls.part_near is ConstraintSet.part_near
+
+    @classmethod
     def has_rows(cls) -> bool:
         """Tell whether the family states `row_slacks`: its sets are made of several rows."""
         return cls.row_slacks is not ConstraintSet.row_slacks

@@ -143,9 +143,9 @@ class HalfSpaces(ConstraintSet):
         """Return the rows in about unit length, with at least so many batch dimensions."""
         if self._kept is not None:
             return self._kept.spread(batch_dims)
-        batch_dims = max(batch_dims, self.normals.ndim - 2, self.offsets.ndim - 1)
-        normals = _spread(self.normals.movedim((-2, -1), (0, 1)), 2, batch_dims).contiguous()
-        offsets = _spread(self.offsets.movedim(-1, 0), 1, batch_dims).contiguous()
+        own_dims = max(self.normals.ndim - 2, self.offsets.ndim - 1)
+        normals = _spread(self.normals.movedim((-2, -1), (0, 1)), 2, own_dims).contiguous()
+        offsets = _spread(self.offsets.movedim(-1, 0), 1, own_dims).contiguous()
         # Normals that do not vanish when squared. An offset out of range beside its normal becomes
         # infinite: no action reaches that row.
         unit = power_of_two(normals.abs().amax(1))
@@ -159,7 +159,7 @@ class HalfSpaces(ConstraintSet):
         # What was found without gradients must not be used with them.
         if not (self.normals.requires_grad or self.offsets.requires_grad):
             self._keep(rows)
-        return rows
+        return rows.spread(batch_dims)
 
     def _with(self, rows: _Rows, offsets: Tensor) -> Self:
         """Return the set with the normals of some rows and other offsets."""
@@ -174,8 +174,10 @@ class HalfSpaces(ConstraintSet):
         return half_spaces
 
     def _keep(self, rows: _Rows) -> None:
-        # A compiler sees by itself what is computed twice.
-        if not torch.compiler.is_compiling():
+        # A compiler sees by itself what is computed twice. Inference tensors are of no use later.
+        if torch.compiler.is_compiling():
+            return
+        if rows.normals.is_inference() == self.normals.is_inference():
             object.__setattr__(self, "_kept", rows)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import is_, itemgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -10,8 +11,9 @@ from torch import Tensor
 from torch.optim import Adam, optimizer
 from torch.optim.optimizer import Optimizer
 
-_PLAIN = {"fused": True, "amsgrad": False, "maximize": False}
-"""The settings of a group under which a step is the fused operation alone."""
+_FLAGS = itemgetter("fused", "amsgrad", "maximize", "decoupled_weight_decay")
+_PLAIN = (True, False, False, False)
+"""The flags of a group under which a step is the fused operation alone."""
 
 
 class _Group(NamedTuple):
@@ -19,6 +21,7 @@ class _Group(NamedTuple):
 
     settings: dict[str, Any]
     parameters: list[Tensor]
+    states: list[dict[str, Tensor]]
     means: list[Tensor]
     squares: list[Tensor]
     steps: list[Tensor]
@@ -46,7 +49,7 @@ class FusedAdam(Adam):
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Make a step, and return what the closure returned, if there is one."""
-        if self._groups is None or closure is not None or not self._is_plain():
+        if self._groups is None or closure is not None or not self._is_plain(self._groups):
             returned = self._adam_step(closure)
             self._groups = self._looked_up()
             return returned
@@ -55,7 +58,7 @@ class FusedAdam(Adam):
         ]
         if any(len(a) < len(b.parameters) for a, b in zip(gradients, self._groups, strict=True)):
             return self._adam_step(closure)
-        for (settings, parameters, means, squares, steps, counts), of_group in zip(
+        for (settings, parameters, _, means, squares, steps, counts), of_group in zip(
             self._groups, gradients, strict=True
         ):
             counts.add_(1)
@@ -107,28 +110,36 @@ class FusedAdam(Adam):
         step = Adam.step if is_wrapped else Optimizer.profile_hook_step(Adam.step)
         return step(self, closure)
 
-    def _is_plain(self) -> bool:
-        """Tell whether neither hooks nor a gradient scaler are to be minded, nor other settings."""
+    def _is_plain(self, groups: list[_Group]) -> bool:
+        """Tell whether groups are as they were looked up, without hooks or a gradient scaler."""
         hooks = (
             self._optimizer_step_pre_hooks,
             self._optimizer_step_post_hooks,
             optimizer._global_optimizer_pre_hooks,
             optimizer._global_optimizer_post_hooks,
         )
-        return not any(hooks) and not hasattr(self, "grad_scale") and not hasattr(self, "found_inf")
+        if any(hooks) or hasattr(self, "grad_scale") or hasattr(self, "found_inf"):
+            return False
+        return len(self.param_groups) == len(groups) and all(
+            settings is group.settings
+            and _has_plain_settings(settings)
+            and len(settings["params"]) == len(group.parameters)
+            and all(map(is_, settings["params"], group.parameters))
+            and all(map(is_, map(self.state.get, group.parameters), group.states))
+            for settings, group in zip(self.param_groups, groups, strict=True)
+        )
 
     def _looked_up(self) -> list[_Group] | None:
         """Return all groups, or None if a step of one of them is more than the fused operation."""
         groups = []
         for settings in self.param_groups:
-            parameters = settings["params"]
+            parameters = list(settings["params"])
             states = [self.state.get(parameter, {}) for parameter in parameters]
             alike = {(parameter.device, parameter.dtype) for parameter in parameters}
             if (
                 len(alike) != 1
                 or not all(states)
-                or any(settings[name] != value for name, value in _PLAIN.items())
-                or isinstance(settings["lr"], Tensor)
+                or not _has_plain_settings(settings)
                 or any(parameter.is_complex() for parameter in parameters)
             ):
                 return None
@@ -138,5 +149,10 @@ class FusedAdam(Adam):
             steps = list(counts)
             for state, step in zip(states, steps, strict=True):
                 state["step"] = step
-            groups.append(_Group(settings, parameters, means, squares, steps, counts))
+            groups.append(_Group(settings, parameters, states, means, squares, steps, counts))
         return groups
+
+
+def _has_plain_settings(settings: dict[str, Any]) -> bool:
+    """Tell whether a step of a group of these settings is the fused operation alone."""
+    return _FLAGS(settings) == _PLAIN and not isinstance(settings["lr"], Tensor)

@@ -12,7 +12,6 @@ from cnfp_torchrl.geometry import (
     Bounds,
     Box,
     Cone,
-    ConstraintSet,
     KinkedSum,
     Rows,
     Superlevel,
@@ -146,7 +145,7 @@ def check_superlevel(example: Example) -> None:
     action = example.actions(5 * _COUNT)
     slack = sets.slack(action)
     level = _check_part(example, "superlevel", part, action)
-    if type(sets).part_near is ConstraintSet.part_near:
+    if sets.is_convex():
         complete = (slack <= 0) | (level >= slack - _tolerance(example, slack))
         expected = "all actions with a slack of t described (if not convex, by part_near)"
         require(

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import CatTensors, EnvBase, TransformedEnv
+from torchrl.envs import CatTensors, EnvBase, ExcludeTransform, TransformedEnv
 
 from cnfp_torchrl.audit import AuditReport, AuditSettings, ConstraintMetrics, Share, audit
 from cnfp_torchrl.audit.states import uniform_states
@@ -353,6 +353,21 @@ def test_a_state_setter_is_given_what_was_observed_before_it_was_concatenated(ou
     report = audit(env, state_setter=set_limit, settings=SMALL)
     assert list(report.sources) == ["rollouts", "uniform"]
     assert not report.flaws
+
+
+def test_entries_that_a_transform_removes_need_not_be_set() -> None:
+    class Counted(Disc):
+        def __init__(self, batch: int) -> None:
+            super().__init__(batch)
+            self.observation_spec["count"] = Unbounded((batch, 1))
+            self.count = 0
+
+        def _shown(self, cost: Tensor) -> TensorDict:
+            self.count += 1
+            return super()._shown(cost).set("count", torch.full_like(cost, self.count))
+
+    env = with_geometry(Counted(64), Share_(0.8)).append_transform(ExcludeTransform("count"))
+    assert not audit(env, state_setter=set_state, settings=SMALL).flaws
 
 
 def test_a_state_setter_that_misses_is_refused() -> None:

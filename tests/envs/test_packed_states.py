@@ -125,6 +125,19 @@ def test_rare_entries_are_what_was_stored(
     assert packed._rare.rows is None or len(packed._rare.rows) <= 8 * (size + agents * horizon)
 
 
+@pytest.mark.parametrize("rare", [[], [("constraints", "a", "low")]])
+@pytest.mark.parametrize("index", [3, slice(1, 4), torch.arange(6).view(2, 3), torch.arange(0)])
+def test_transitions_are_looked_up_in_any_shape(
+    index: int | slice | torch.Tensor, rare: Sequence[NestedKey]
+) -> None:
+    buffer, _ = filled(stream(10, 1, 4), 100, rare)
+    stored = next(stream(10, 1, 4))
+    given, expected = (td[index] for td in (buffer, stored))
+    torch.testing.assert_close(
+        given.select(*expected.keys(True, True)).to_dict(), expected.to_dict(), rtol=0, atol=0
+    )
+
+
 def test_batches_of_other_sizes_and_in_another_order_are_right() -> None:
     generator = torch.Generator().manual_seed(1)
     batches = [

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cnfp_torchrl.geometry import PositivePart, WeightedL1Ball
+from cnfp_torchrl.geometry import ConstraintSet, PositivePart, WeightedL1Ball
 from cnfp_torchrl.testing import check_constraint_set
 from tests.geometry.cases import CASES, DTYPES, Case
 
@@ -36,6 +36,33 @@ def test_gradients_in_the_fields_are_those_of_finite_differences(case: Case) -> 
         return type(case.sets)(**moved, validate_args=False).gauge(direction, case.inside)
 
     assert torch.autograd.gradcheck(gauge, logs, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_what_was_asked_before_changes_no_shape(case: Case) -> None:
+    def shapes(sets: ConstraintSet) -> list[torch.Size]:
+        values = [*sets.bounding_box(), sets.rounding(), sets.eroded().slack(case.inside)]
+        return [
+            value.shape
+            for value in (*values, *sets.select(sets.batch_shape, every).fields().values())
+        ]
+
+    every = torch.arange(case.sets.batch_shape.numel())
+    asked, other = (case.sets.with_fields(lambda field, _: field) for _ in range(2))
+    more = case.inside.expand(3, *case.inside.shape)
+    asked.slack(more)
+    asked.gauge(torch.ones_like(more), more)
+    assert shapes(asked) == shapes(other)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_gradients_follow_what_was_asked_in_inference_mode(case: Case) -> None:
+    sets = case.sets.with_fields(lambda field, _: field)
+    with torch.inference_mode():
+        sets.slack(case.inside)
+    action = case.inside.clone().requires_grad_()
+    sets.slack(action).sum().backward()
+    assert action.grad is not None
 
 
 @pytest.mark.parametrize("family", [WeightedL1Ball, PositivePart])

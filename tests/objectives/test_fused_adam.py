@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -53,6 +53,14 @@ def with_more_parameters(optimizer: Adam, network: nn.Module, count: int) -> Non
         network.added.grad = torch.ones(2)
 
 
+def with_groups_of_another_make(optimizer: Adam, _: nn.Module, count: int) -> None:
+    first, second = optimizer.param_groups
+    if count == 3:
+        optimizer.param_groups[0] = {**first, "lr": 0.02}
+    elif count == 4:
+        first["params"].append(second["params"].pop())
+
+
 def with_a_hook(optimizer: Adam, network: nn.Module, count: int) -> None:
     def halve(*_: Any) -> None:
         for parameter in network.parameters():
@@ -63,6 +71,25 @@ def with_a_hook(optimizer: Adam, network: nn.Module, count: int) -> None:
         optimizer.register_step_pre_hook(halve)
 
 
+def with_other_settings(optimizer: Adam, _: nn.Module, count: int) -> None:
+    optimizer.param_groups[0]["maximize"] = count in (2, 3)
+    optimizer.param_groups[1]["decoupled_weight_decay"] = count > 3
+
+
+def begun_anew(optimizer: Adam, _: nn.Module, count: int) -> None:
+    if count == 3:
+        optimizer.state.clear()
+
+
+def with_a_parameter_replaced(optimizer: Adam, network: nn.Module, count: int) -> None:
+    if count == 3:
+        layer = cast(nn.Linear, next(network.children()))
+        replaced = nn.Parameter(torch.full((4, 3), 0.5))
+        replaced.grad = torch.ones(4, 3)
+        del optimizer.state[layer.weight]
+        layer.weight = optimizer.param_groups[0]["params"][0] = replaced
+
+
 @pytest.mark.parametrize(
     "between",
     [
@@ -71,12 +98,22 @@ def with_a_hook(optimizer: Adam, network: nn.Module, count: int) -> None:
         with_another_rate,
         loaded,
         with_more_parameters,
+        with_groups_of_another_make,
         with_a_hook,
+        with_other_settings,
+        begun_anew,
+        with_a_parameter_replaced,
     ],
 )
 @pytest.mark.parametrize(
     "options",
-    [{}, {"weight_decay": 0.1, "betas": (0.5, 0.9)}, {"amsgrad": True}, {"fused": False}],
+    [
+        {},
+        {"weight_decay": 0.1, "betas": (0.5, 0.9)},
+        {"weight_decay": 0.1, "decoupled_weight_decay": True},
+        {"amsgrad": True},
+        {"fused": False},
+    ],
 )
 def test_it_is_adam(between: Callable[..., Adam | None], options: dict[str, Any]) -> None:
     expected = trained(Adam, between, **{"fused": True, **options})

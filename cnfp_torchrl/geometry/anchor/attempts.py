@@ -117,11 +117,7 @@ def first_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None = None
 def _is_described(constraint_set: ConstraintSet) -> bool:
     """Tell whether steps inwards see all of a set, so that they make up for a first attempt."""
     described = type(constraint_set).superlevel is not ConstraintSet.superlevel
-    return described and _is_convex(constraint_set)
-
-
-def _is_convex(constraint_set: ConstraintSet) -> bool:
-    return type(constraint_set).part_near is ConstraintSet.part_near
+    return described and constraint_set.is_convex()
 
 
 def _bounding_box(bounds: Box, sets: Sequence[ConstraintSet]) -> Bounds:
@@ -187,7 +183,7 @@ def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt, depth: Tenso
     Returns:
         The attempts in all states, side by side.
     """
-    if all(map(_is_convex, sets)) and bool((before.upper < -depth).all()):
+    if all(s.is_convex() for s in sets) and bool((before.upper < -depth).all()):
         return before.select()
     ascent = Ascent(sets, before.anchor, before.upper)
     if not ascent.of.sees_all:

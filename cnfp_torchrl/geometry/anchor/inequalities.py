@@ -100,7 +100,7 @@ class Inequalities:
         bounds = bounds_of(sets)
         low, high = self.batch_last(bounds.low), self.batch_last(bounds.high)
         self.middle, self.half = (low + high) / 2, (high - low) / 2
-        self.sees_all = all(type(s).part_near is ConstraintSet.part_near for s in sets)
+        self.sees_all = all(s.is_convex() for s in sets)
         for box in sets[1:]:
             if isinstance(box, Box):
                 low = torch.maximum(low, self.batch_last(box.low))

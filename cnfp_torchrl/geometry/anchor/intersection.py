@@ -78,7 +78,7 @@ class Intersection:
             if part is not None:
                 # One inequality for each row, or several that make up a single one.
                 owners[type(part)] += [first + (j if count == width else 0) for j in range(count)]
-            if part is None or count != width or not _is_convex(sets[i]):
+            if part is None or count != width or not sets[i].is_convex():
                 own.append(i)
             first += width
         described = np.array(owners[KinkedSum] + owners[Rows] + owners[Cone])
@@ -91,7 +91,7 @@ class Intersection:
     @property
     def convex(self) -> list[bool]:
         """Which of the sets are convex."""
-        return [_is_convex(s) for s in self.sets]
+        return [s.is_convex() for s in self.sets]
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -161,7 +161,3 @@ class Intersection:
         return maximize_slack_by_cuts(
             problem, sets, required[:, rows], maximized[:, rows], counts[:, rows], start, settled
         )
-
-
-def _is_convex(constraint_set: ConstraintSet) -> bool:
-    return type(constraint_set).part_near is ConstraintSet.part_near

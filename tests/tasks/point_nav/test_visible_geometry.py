@@ -91,7 +91,7 @@ def test_sight_is_never_unsafe_and_holds_more_than_the_box(layout: str) -> None:
 
 
 def pressed(chart: Layout) -> Tensor:
-    """Return positions off every edge, wall and corner, from one rounding error to the margin."""
+    """Return positions off every edge, wall and corner by up to the margin, and on the walls."""
     wall = torch.tensor(chart.wall)
     boxes = torch.cat(
         [
@@ -102,7 +102,7 @@ def pressed(chart: Layout) -> Tensor:
     side = torch.ones_like(boxes)
     side[:, 0] = -1
     side[-1] *= -1
-    found = []
+    found = [wall * torch.tensor([[1, 0.9], [-1, 0.9], [0.9, 1], [0.9, -1], [1, 1], [-1, -1]])]
     for gap in (0.0, 1e-6, 5e-5, 3e-4):
         off = torch.where(side > 0, boxes + gap, boxes - gap)
         off = torch.where(off == boxes, torch.nextafter(boxes, boxes + side), off)
