@@ -123,14 +123,11 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                 return next_tensordict
             found = step.begun.all_held()
         else:
-            begun = step.begun
-            if step.is_published:
-                begun = begun._replace(sets=geometry.sets(next_tensordict))
-            found = finish_anchor(begun, self._leeway)
+            found = finish_anchor(step.begun, self._leeway)
             if self._watch.looks and bool(found.active.all()):
                 self._watch.all_held(batch.numel())
             else:
-                self._watch(begun.sets, found.largest(), batch.numel())
+                self._watch(step.begun.sets, found.largest(), batch.numel())
         for key, value in anchor_entries(found, self._bijectors, batch).items():
             next_tensordict.set(key, value)
         return next_tensordict

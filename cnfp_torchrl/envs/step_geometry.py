@@ -24,9 +24,13 @@ from cnfp_torchrl.geometry import (
     GeometryError,
     are_within,
     begin_anchor,
+    continue_anchor,
 )
 from cnfp_torchrl.keys import ANCHOR_KEY, SAFE_ACTION_KEY
 from cnfp_torchrl.modules import ConstraintBijector
+
+_MOST_STEPPED = 512
+"""The largest batch in which steps inwards in all states take less time than finding some."""
 
 _OF_OTHERS = re.compile(
     r"G\['__import_(?!(torch|torchrl|tensordict|cnfp_torchrl|typing|collections|math)(_dot_|'))"
@@ -38,7 +42,7 @@ class Step(NamedTuple):
     """What is known of the anchors in some states before any search.
 
     Attributes:
-        begun: What a search goes on from; of a compiled pass without the sets.
+        begun: What a search goes on from; without sets where a compiled pass decided all states.
         is_decided: Whether all states need no search.
         is_published: Whether it is published already that all constraints hold.
     """
@@ -55,7 +59,9 @@ class StepGeometry:
     are as they must be and whether a search is needed, is read at once: on a GPU each read waits.
 
     Compiled, it is one graph, made at the first call, and again for another batch size or dtype.
-    What depends on shapes alone is then not checked: the geometries have done so at the reset.
+    What depends on shapes alone is then not checked: the geometries have done so at the reset. In
+    small batches a second graph takes steps inwards, made at the first step that leaves a state
+    undecided.
 
     Args:
         geometries: The transforms of the constraints that are published here, in order; none where
@@ -80,11 +86,15 @@ class StepGeometry:
             keys = [key for geometry in geometries for key in geometry.in_keys]
             keys += [key for b in bijectors if b.name not in published for key in b.geometry_keys]
             self._keys = list(dict.fromkeys([*keys, SAFE_ACTION_KEY]))
-            self._compiled = torch.compile(  # type: ignore[call-overload]  # unknown to its overloads
-                self._all_published,
-                dynamic=False,
-                isolate_recompiles=True,
-                options={"guard_filter_fn": _those_that_may_change},
+            self._set_keys = [key for b in bijectors for key in b.geometry_keys]
+            self._compiled, self._compiled_steps = (
+                torch.compile(  # type: ignore[call-overload]  # unknown to its overloads
+                    function,
+                    dynamic=False,
+                    isolate_recompiles=True,
+                    options={"guard_filter_fn": _those_that_may_change},
+                )
+                for function in (self._all_published, self._all_stepped)
             )
 
     def __call__(self, states: TensorDictBase) -> Step:
@@ -99,13 +109,20 @@ class StepGeometry:
         else:
             inputs = {key: states.get(key, None) for key in self._keys}
             published, begun, flags, limits = self._compiled(inputs, states.batch_size)
-            for key, value in published.items():
-                states.set(key, value)
+            _write(states, published)
             checks = []
         decided, *values = flags.tolist()
         if not are_within(values, limits):
             refuse_values(checks or self._checks(states))
-        return Step(begun, bool(decided), self._compiled is not None)
+        is_decided = bool(decided)
+        if self._compiled is not None and not is_decided:
+            begun = begun._replace(sets=self.sets(states))
+            if states.numel() <= _MOST_STEPPED and begun.steps_may_help():
+                sets = {key: states.get(key) for key in self._set_keys}
+                published, after, flag = self._compiled_steps(sets, begun._replace(sets=()))
+                begun, is_decided = after._replace(sets=begun.sets), bool(flag)
+                _write(states, published)
+        return Step(begun, is_decided, self._compiled is not None)
 
     def sets(self, states: TensorDictBase) -> list[ConstraintSet]:
         """Return the action bounds and the published sets, in order of application."""
@@ -137,6 +154,17 @@ class StepGeometry:
         published.update(anchor_entries(begun.all_held(), self._bijectors, batch))
         return published, begun._replace(sets=()), *_flags(begun, checks)
 
+    def _all_stepped(
+        self, sets: dict[NestedKey, Tensor], before: Begun
+    ) -> tuple[dict[NestedKey, Tensor], Begun, Tensor]:
+        """Return what is published where all constraints hold, after steps inwards."""
+        batch = before.attempt.decided.shape
+        states = TensorDict({}, batch)
+        _write(states, sets)
+        begun = continue_anchor(before._replace(sets=self.sets(states)))
+        published = anchor_entries(begun.all_held(), self._bijectors, batch)
+        return published, begun._replace(sets=()), begun.attempt.decided.all()
+
     def _checks(self, states: TensorDictBase) -> list[Check]:
         """Return what is to be checked of states for which the compiled pass did not say it."""
         checked = (geometry for geometry in self.geometries if geometry.validate)
@@ -158,6 +186,11 @@ class StepGeometry:
                 )
             sets.append(allowed.to(self.bounds.dtype))
         return sets
+
+
+def _write(states: TensorDictBase, entries: dict[NestedKey, Tensor]) -> None:
+    for key, value in entries.items():
+        states.set(key, value)
 
 
 def _those_that_may_change(guards: Sequence[Any]) -> list[bool]:

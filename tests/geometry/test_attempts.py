@@ -110,7 +110,7 @@ def test_steps_of_compiled_code_lead_where_others_do() -> None:
         sets = [s.to(torch.float32, "cpu") for s in random_sets(rng, 20)]
         found = lexicographic_anchor(sets)
         for steps in (0, 1, REFINEMENT):
-            anchor, _, decided = stepped_attempt(sets, None, steps)
+            anchor, _, decided = stepped_attempt(sets, first_attempt(sets), steps)
             torch.testing.assert_close(anchor[decided], found.anchor[decided], rtol=0, atol=1e-5)
             assert found.active[decided].all()
         most, few = most + int(decided.sum()), few + int(first_attempt(sets).decided.sum())

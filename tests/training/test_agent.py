@@ -43,7 +43,7 @@ def test_a_refusal_is_not_hidden_by_processes_that_never_began() -> None:
 @pytest.mark.parametrize(
     ("overrides", "functions"),
     [
-        (["compile=true"], ["StepGeometry._all_published"]),
+        (["compile=true"], ["StepGeometry._all_published", "StepGeometry._all_stepped"]),
         (["compile=false"], []),
         # Without an anchor, and without constraints, nothing calls it.
         (["compile=true", "flow=squash"], []),

@@ -137,34 +137,39 @@ def further_attempt(sets: Sequence[ConstraintSet], before: Attempt, steps: int) 
     return _roomiest(bounds, sets, _bounding_box(bounds, sets), points, ascent.bound)
 
 
-def stepped_attempt(sets: Sequence[ConstraintSet], candidate: Tensor | None, steps: int) -> Attempt:
-    """Try as `first_attempt`, then take the first steps of `refined_attempt` where they may help.
+def stepped_attempt(
+    sets: Sequence[ConstraintSet], before: Attempt, steps: int = REFINEMENT
+) -> Attempt:
+    """Take the steps of `refined_attempt` in all states, of which those move that need them.
 
-    Reads no tensor on the host. States that are left undecided stay as `first_attempt` left them.
+    Reads no tensor on the host. States that are left undecided stay as they were.
 
     Args:
         sets: Sets of batch shapes that broadcast, the first of them the box of action bounds.
-        candidate: Points that may lie in all sets, ``(*batch, d)``.
+        before: The attempt to start from, ``(*batch,)``.
         steps: The number of steps inwards.
     """
-    found = first_attempt(sets, candidate)
-    if not all(map(_is_described, sets)) or _is_settled_at_first(sets):
-        return found
+    if not steps_may_help(sets):
+        return before
     depth = functools.reduce(torch.maximum, (depths.amax(-1) for depths in row_depths(sets)))
-    ascent = Ascent(sets, found.anchor, found.upper)
-    refined = Attempt(*ascent.run_until(steps, SHARE, depth, reads=False))
-    refined = refined.view(found.decided.shape)
-    is_new = (refined.decided & ~found.decided).unsqueeze(-1)
-    anchor = torch.where(is_new, refined.anchor, found.anchor)
-    return Attempt(anchor, found.upper, found.decided | refined.decided)
+    ascent = Ascent(sets, before.anchor, before.upper)
+    found = Attempt(*ascent.run_until(steps, SHARE, depth, reads=False)).view(before.decided.shape)
+    is_new = (found.decided & ~before.decided).unsqueeze(-1)
+    anchor = torch.where(is_new, found.anchor, before.anchor)
+    return Attempt(anchor, before.upper, before.decided | found.decided)
 
 
-def _is_settled_at_first(sets: Sequence[ConstraintSet]) -> bool:
-    """Tell whether a first attempt decides all states in which all sets hold."""
+def steps_may_help(sets: Sequence[ConstraintSet]) -> bool:
+    """Tell whether steps inwards see all sets, and may decide states that a first attempt cannot.
+
+    A first attempt decides all states in which boxes and one set of closed form hold together.
+    """
     bounds, others = bounds_of(sets), [s for s in sets[1:] if not isinstance(s, Box)]
-    if len(others) > 1 or 1 / (1 + math.sqrt(bounds.dim)) < SHARE:
+    if not all(map(_is_described, sets)):
         return False
-    return all(s.deepest_within(bounds.bounding_box()) is not None for s in others)
+    if len(others) > 1 or 1 / (1 + math.sqrt(bounds.dim)) < SHARE:
+        return True
+    return any(s.deepest_within(bounds.bounding_box()) is None for s in others)
 
 
 def refined_attempt(sets: Sequence[ConstraintSet], before: Attempt, depth: Tensor) -> Attempt:

@@ -27,12 +27,13 @@ from cnfp_torchrl.geometry.anchor.attempts import (
     first_attempt,
     refined_attempt,
     stepped_attempt,
+    steps_may_help,
 )
 from cnfp_torchrl.geometry.anchor.depth import bounds_of, row_depths
 from cnfp_torchrl.geometry.anchor.intersection import Intersection
 from cnfp_torchrl.geometry.anchor.program import Array, Flags, Index
 from cnfp_torchrl.geometry.anchor.search import PRECISION, Anchored, Search
-from cnfp_torchrl.geometry.constraint_set import ConstraintSet, broadcast_shape
+from cnfp_torchrl.geometry.constraint_set import ConstraintSet
 
 LEEWAY = 1e-3
 """The amount by which rows are relaxed beyond the least one, as a share of the bounds' width.
@@ -45,13 +46,6 @@ times larger and the log-density, which the entropy weight must make up for, d l
 the log-density is some 8 d above that of the bounds, and float32's rounding is a thousandth of what
 is left.
 """
-
-
-_COMPILED_STEPS = 3
-"""The number of steps inwards that compiled code takes in all states of a small batch."""
-
-_MOST_STEPPED = 512
-"""The largest batch in which that takes less time than looking which states need them."""
 
 
 class Begun(NamedTuple):
@@ -72,22 +66,32 @@ class Begun(NamedTuple):
         amounts = tuple(anchor.new_zeros(*shape, s.row_count()) for s in self.sets)
         return Anchored(anchor, active, amounts)
 
+    def steps_may_help(self) -> bool:
+        """Tell whether `continue_anchor` may decide states that are undecided."""
+        return steps_may_help(self.sets)
+
 
 @torch.no_grad()
 def begin_anchor(sets: Sequence[ConstraintSet], candidate: Tensor | None = None) -> Begun:
     """Make the attempts that take the least time, and read no tensor on the host.
 
-    In small batches compiled code takes the first steps inwards, too, which then cost little.
-
     Args:
         sets: Sets in order of application, as in `lexicographic_anchor`.
         candidate: Points that may lie in all sets, ``(*batch, d)``.
     """
-    if torch.compiler.is_compiling():
-        count = broadcast_shape(*(s.batch_shape for s in sets)).numel()
-        if count <= _MOST_STEPPED:
-            return Begun(sets, stepped_attempt(sets, candidate, _COMPILED_STEPS))
     return Begun(sets, first_attempt(sets, candidate))
+
+
+@torch.no_grad()
+def continue_anchor(begun: Begun) -> Begun:
+    """Take the steps inwards of `finish_anchor` in all states that they may decide, side by side.
+
+    For compiled code, in which a step costs little: reads no tensor on the host.
+
+    Args:
+        begun: What `begin_anchor` returned.
+    """
+    return begun._replace(attempt=stepped_attempt(begun.sets, begun.attempt))
 
 
 def lexicographic_anchor(
