@@ -250,7 +250,7 @@ class ConstraintSet(ABC):
         have any.
 
         Args:
-            box: finite bounds ``(*batch, d)``.
+            box: Bounds, finite, ``(*batch, d)``.
 
         Returns:
             Points ``(*batch, d)``; None, the default, where there is no such form.

@@ -279,10 +279,10 @@ class SeenFromOutside(VisibleRegion):
     straight move touches none of the rectangles themselves.
 
     Args:
-        position: points that are seen from, ``(*batch, d)``, in units of length.
-        rectangles: corners of the grown rectangles, ``(*batch, m, 2, d)``.
-        step: lengths moved by an action of one, ``(*batch,)``.
-        moved: actions that lead from the true position to that point, ``(*batch, d)``; 0 where
+        position: Points that are seen from, ``(*batch, d)``, in units of length.
+        rectangles: Corners of the grown rectangles, ``(*batch, m, 2, d)``.
+        step: Lengths moved by an action of one, ``(*batch,)``.
+        moved: Actions that lead from the true position to that point, ``(*batch, d)``; 0 where
             they are the same.
     """
 
