@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
-from cnfp_torchrl.envs.geometry_transform import GeometryTransform
+from cnfp_torchrl.envs.geometry_transform import GeometryTransform, write_entries
 from cnfp_torchrl.envs.relaxation_watch import RelaxationWatch
 from cnfp_torchrl.envs.step_geometry import StepGeometry, anchor_entries
 from cnfp_torchrl.geometry import LEEWAY, Box, finish_anchor
@@ -128,8 +128,7 @@ class ConstraintAnchor(Transform, ConstraintPublisher):
                 self._watch.all_held(batch.numel())
             else:
                 self._watch(step.begun.sets, found.largest(), batch.numel())
-        for key, value in anchor_entries(found, self._bijectors, batch).items():
-            next_tensordict.set(key, value)
+        write_entries(next_tensordict, anchor_entries(found, self._bijectors, batch))
         return next_tensordict
 
     def _take_over(self) -> StepGeometry:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, NoReturn, Self
 
@@ -308,8 +308,7 @@ class GeometryTransform(Transform, ConstraintPublisher):
         if self.validate and not torch.compiler.is_compiling():
             self._check_shapes(allowed)
         entries = self.published(states, allowed)
-        for key, value in entries.items():
-            states.set(key, value)
+        write_entries(states, entries)
         fields = allowed.fields()
         as_published = {field: entries[field_key(self.name, field)] for field in fields}
         if any(as_published[field] is not value for field, value in fields.items()):
@@ -481,6 +480,12 @@ def _is_missing_entry(error: BaseException) -> bool:
         trace = trace.tb_next
     module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
     return isinstance(error, KeyError) and module.partition(".")[0] == "tensordict"
+
+
+def write_entries(states: TensorDictBase, entries: Mapping[Any, Tensor]) -> None:
+    """Write entries into states, by their keys."""
+    for key, value in entries.items():
+        states.set(key, value)
 
 
 class Check(NamedTuple):

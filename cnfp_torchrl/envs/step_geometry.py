@@ -15,6 +15,7 @@ from cnfp_torchrl.envs.geometry_transform import (
     GeometryTransform,
     evidence,
     refuse_values,
+    write_entries,
 )
 from cnfp_torchrl.geometry import (
     Anchored,
@@ -109,7 +110,7 @@ class StepGeometry:
         else:
             inputs = {key: states.get(key, None) for key in self._keys}
             published, begun, flags, limits = self._compiled(inputs, states.batch_size)
-            _write(states, published)
+            write_entries(states, published)
             checks = []
         decided, *values = flags.tolist()
         if not are_within(values, limits):
@@ -121,7 +122,7 @@ class StepGeometry:
                 sets = {key: states.get(key) for key in self._set_keys}
                 published, after, flag = self._compiled_steps(sets, begun._replace(sets=()))
                 begun, is_decided = after._replace(sets=begun.sets), bool(flag)
-                _write(states, published)
+                write_entries(states, published)
         return Step(begun, is_decided, self._compiled is not None)
 
     def sets(self, states: TensorDictBase) -> list[ConstraintSet]:
@@ -147,9 +148,7 @@ class StepGeometry:
     ) -> tuple[dict[NestedKey, Tensor], Begun, Tensor, list[float]]:
         """Return what is published where all constraints hold, and what `_begun` does."""
         states = TensorDict({}, batch)
-        for key, value in inputs.items():
-            if value is not None:
-                states.set(key, value)
+        write_entries(states, {k: value for k, value in inputs.items() if value is not None})
         begun, checks, published = self._begun(states)
         published.update(anchor_entries(begun.all_held(), self._bijectors, batch))
         return published, begun._replace(sets=()), *_flags(begun, checks)
@@ -160,7 +159,7 @@ class StepGeometry:
         """Return what is published where all constraints hold, after steps inwards."""
         batch = before.attempt.decided.shape
         states = TensorDict({}, batch)
-        _write(states, sets)
+        write_entries(states, sets)
         begun = continue_anchor(before._replace(sets=self.sets(states)))
         published = anchor_entries(begun.all_held(), self._bijectors, batch)
         return published, begun._replace(sets=()), begun.attempt.decided.all()
@@ -186,11 +185,6 @@ class StepGeometry:
                 )
             sets.append(allowed.to(self.bounds.dtype))
         return sets
-
-
-def _write(states: TensorDictBase, entries: dict[NestedKey, Tensor]) -> None:
-    for key, value in entries.items():
-        states.set(key, value)
 
 
 def _those_that_may_change(guards: Sequence[Any]) -> list[bool]:

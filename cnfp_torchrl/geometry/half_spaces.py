@@ -153,9 +153,8 @@ class HalfSpaces(ConstraintSet):
         # Not `torch.linalg.vector_norm`, which is slow along the first dimensions.
         squares = normals.square().sum(1)
         zero = squares == 0
-        # A normal of zero lets every action pass, or none.
-        offsets = torch.where(zero & (offsets >= 0), torch.inf, offsets / unit)
-        rows = _Rows(normals, offsets, squares.masked_fill(zero, 1).sqrt())
+        rates = squares.masked_fill(zero, 1).sqrt()
+        rows = _Rows(normals, _passed(zero, offsets / unit), rates)
         # What was found without gradients must not be used with them.
         if not (self.normals.requires_grad or self.offsets.requires_grad):
             self._keep(rows)
@@ -163,8 +162,7 @@ class HalfSpaces(ConstraintSet):
 
     def _with(self, rows: _Rows, offsets: Tensor) -> Self:
         """Return the set with the normals of some rows and other offsets."""
-        passed = (rows.normals == 0).all(1) & (offsets >= 0)
-        return self._of(rows._replace(offsets=torch.where(passed, torch.inf, offsets)))
+        return self._of(rows._replace(offsets=_passed((rows.normals == 0).all(1), offsets)))
 
     def _of(self, rows: _Rows) -> Self:
         """Return the set of some rows."""
@@ -218,6 +216,11 @@ class _Rows(NamedTuple):
         """Return the products with vectors ``(*batch, d)``, of no more dimensions than here."""
         vector = _spread(vector.movedim(-1, 0), 1, self.offsets.ndim - 1)
         return (self.normals * vector).sum(1)
+
+
+def _passed(zero: Tensor, offsets: Tensor) -> Tensor:
+    """Return offsets, infinite where a normal of zero lets every action pass, not none."""
+    return torch.where(zero & (offsets >= 0), torch.inf, offsets)
 
 
 def _spread(value: Tensor, events: int, batch_dims: int) -> Tensor:
